@@ -1,0 +1,132 @@
+"""Safe set f_S, constraint estimator f_C and goal estimator f_G: three binary judgements of a latent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.modules import MLP
+
+from ls3_torchrl._checks import require_keys
+
+
+class LatentClassifier(TensorDictModuleBase):
+    """Probability that a latent has a property: 3 hidden layers of 256, a logit out (section 1.1.1).
+
+    Args:
+        latent_dim: D.
+        hidden: sizes of the hidden layers.
+        latent_key: latent ``[*B, D]``.
+        logit_key: where the logit ``[*B, 1]`` is written.
+        prob_key: where the probability ``[*B, 1]`` is written as well; nowhere when ``None``.
+
+    Raises:
+        KeyError: when the latent is missing.
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        *,
+        hidden: Sequence[int] = (256, 256, 256),
+        latent_key: NestedKey = "latent",
+        logit_key: NestedKey = "logit",
+        prob_key: NestedKey | None = None,
+    ) -> None:
+        super().__init__()
+        self.in_keys = [latent_key]
+        self.out_keys = [logit_key] if prob_key is None else [logit_key, prob_key]
+        self.network: nn.Module = MLP(
+            in_features=latent_dim, out_features=1, num_cells=list(hidden), activation_class=nn.ReLU
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the logit, and the probability where it was asked for."""
+        require_keys(tensordict, self.in_keys, type(self).__name__)
+        logit: Tensor = self.network(tensordict.get(self.in_keys[0]))
+        tensordict.set(self.out_keys[0], logit)
+        if len(self.out_keys) > 1:
+            tensordict.set(self.out_keys[1], logit.sigmoid())
+        return tensordict
+
+    def probability(self, latent: Tensor) -> Tensor:
+        """Probabilities ``[*B, 1]`` in [0, 1] of latents ``[*B, D]``."""
+        return self.network(latent).sigmoid()
+
+
+class SafeSet(LatentClassifier):
+    """f_S(z): can a state be brought back into a trajectory that succeeded? (equation (5)).
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> safe_set = SafeSet(latent_dim=8, prob_key="safe_set_prob")
+        >>> td = safe_set(TensorDict({"latent": torch.zeros(4, 8)}, [4]))
+        >>> td["safe_set_logit"].shape, td["safe_set_prob"].shape
+        (torch.Size([4, 1]), torch.Size([4, 1]))
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        *,
+        hidden: Sequence[int] = (256, 256, 256),
+        latent_key: NestedKey = "latent",
+        logit_key: NestedKey = "safe_set_logit",
+        prob_key: NestedKey | None = None,
+    ) -> None:
+        super().__init__(
+            latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key
+        )
+
+
+class ConstraintEstimator(LatentClassifier):
+    """f_C(z): does the state violate the constraint? Arguments as for :class:`LatentClassifier`.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> td = ConstraintEstimator(latent_dim=8)(TensorDict({"latent": torch.zeros(4, 8)}, [4]))
+        >>> td["constraint_logit"].shape
+        torch.Size([4, 1])
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        *,
+        hidden: Sequence[int] = (256, 256, 256),
+        latent_key: NestedKey = "latent",
+        logit_key: NestedKey = "constraint_logit",
+        prob_key: NestedKey | None = None,
+    ) -> None:
+        super().__init__(
+            latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key
+        )
+
+
+class GoalEstimator(LatentClassifier):
+    """f_G(z): does the state lie in the goal set? Arguments as for :class:`LatentClassifier`.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> td = GoalEstimator(latent_dim=8)(TensorDict({"latent": torch.zeros(4, 8)}, [4]))
+        >>> td["goal_logit"].shape
+        torch.Size([4, 1])
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        *,
+        hidden: Sequence[int] = (256, 256, 256),
+        latent_key: NestedKey = "latent",
+        logit_key: NestedKey = "goal_logit",
+        prob_key: NestedKey | None = None,
+    ) -> None:
+        super().__init__(
+            latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key
+        )

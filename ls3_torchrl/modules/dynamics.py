@@ -1,0 +1,124 @@
+"""Probabilistic ensemble dynamics f_dyn over latents (equation (2); Chua et al., 2018)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from ls3_torchrl._checks import require_choice, require_keys
+from ls3_torchrl.modules.ensemble import EnsembleMLP
+
+Propagation = Literal["ts1", "tsinf"]
+
+
+class EnsembleDynamics(TensorDictModuleBase):
+    """M networks, each a Gaussian over the next latent: N(z + Δ_m(z, a), σ_m(z, a)²).
+
+    Two hidden layers of 128 (section 1.1.1). ``forward`` imagines one step: every row, a particle, is moved by
+    one member and its noise.
+
+    * ``"ts1"``: each row draws a member anew at every step (TS-1, the paper's choice).
+    * ``"tsinf"``: a row keeps the member that it drew first; it travels under ``member_key`` (TS-∞).
+
+    Members and noise that are already in the tensordict are used as they are, which makes rollouts repeatable.
+
+    Args:
+        latent_dim: D.
+        action_dim: A.
+        num_members: M.
+        hidden: sizes of the hidden layers.
+        propagation: ``"ts1"`` or ``"tsinf"``.
+        log_scale_bounds: range that the log standard deviation is clamped to.
+        latent_key: latent ``[*B, D]``.
+        action_key: action ``[*B, A]``, in the environment's units.
+        next_latent_key: where the imagined next latent ``[*B, D]`` is written.
+        member_key: member of each row, int64 ``[*B, 1]`` in 0…M−1; drawn when absent, written for ``"tsinf"``.
+        noise_key: standard normal noise ``[*B, D]``; drawn when absent.
+
+    Raises:
+        ValueError: for an unknown propagation.
+        KeyError: when latent or action is missing.
+
+    Source: Chua et al., "Deep Reinforcement Learning in a Handful of Trials", section 5 and appendix.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> dynamics = EnsembleDynamics(latent_dim=8, action_dim=2)
+        >>> td = TensorDict({"latent": torch.zeros(4, 8), "action": torch.zeros(4, 2)}, [4])
+        >>> dynamics(td)["next", "latent"].shape
+        torch.Size([4, 8])
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        action_dim: int,
+        *,
+        num_members: int = 5,
+        hidden: Sequence[int] = (128, 128),
+        propagation: Propagation = "ts1",
+        log_scale_bounds: tuple[float, float] = (-8.0, 4.0),
+        latent_key: NestedKey = "latent",
+        action_key: NestedKey = "action",
+        next_latent_key: NestedKey = ("next", "latent"),
+        member_key: NestedKey = "dynamics_member",
+        noise_key: NestedKey = "dynamics_noise",
+    ) -> None:
+        super().__init__()
+        require_choice(propagation, ("ts1", "tsinf"), "propagation")
+        low, high = log_scale_bounds
+        if not low < high:
+            raise ValueError(f"log_scale_bounds must rise, got {log_scale_bounds}.")
+        self.latent_dim, self.action_dim, self.num_members = latent_dim, action_dim, num_members
+        self.propagation: Propagation = propagation
+        self.log_scale_bounds = (float(low), float(high))
+        self.in_keys = [latent_key, action_key]
+        self.out_keys = [next_latent_key]
+        self.member_key, self.noise_key = member_key, noise_key
+        self.network = EnsembleMLP(
+            latent_dim + action_dim, 2 * latent_dim, num_members=num_members, hidden=hidden
+        )
+
+    def distribution(self, latent: Tensor, action: Tensor, *, per_member: bool = False) -> tuple[Tensor, Tensor]:
+        """Every member's mean and standard deviation of the next latent.
+
+        Args:
+            latent: ``[*B, D]``, or ``[*B, M, D]`` with ``per_member``.
+            action: ``[*B, A]``, or ``[*B, M, A]`` with ``per_member``.
+            per_member: member m sees column m of the last batch dimension.
+
+        Returns:
+            Mean and standard deviation, each ``[*B, M, D]``.
+        """
+        delta, log_scale = self.network(torch.cat([latent, action], -1), per_member=per_member).chunk(2, -1)
+        loc = (latent if per_member else latent.unsqueeze(-2)) + delta
+        return loc, log_scale.clamp(*self.log_scale_bounds).exp()
+
+    def draw_members(self, num_rows: int, *, device: torch.device | None = None) -> Tensor:
+        """Members for ``num_rows`` particles, int64 ``[num_rows]``: as even a split as can be, in random order."""
+        order = torch.randperm(num_rows, device=device) % self.num_members
+        return torch.randperm(self.num_members, device=device)[order]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Move every row by one member and write the next latent."""
+        require_keys(tensordict, self.in_keys, "EnsembleDynamics")
+        latent, action = (tensordict.get(key) for key in self.in_keys)
+        members = tensordict.get(self.member_key, None)
+        if members is None:
+            members = self.draw_members(latent[..., 0].numel(), device=latent.device)
+            members = members.reshape(*latent.shape[:-1], 1)
+            if self.propagation == "tsinf":
+                tensordict.set(self.member_key, members)
+        noise = tensordict.get(self.noise_key, None)
+        if noise is None:
+            noise = torch.randn_like(latent)
+        loc, scale = self.distribution(latent, action)
+        index = members.unsqueeze(-1).expand(*members.shape, self.latent_dim)
+        chosen = [value.gather(-2, index).squeeze(-2) for value in (loc, scale)]
+        return tensordict.set(self.out_keys[0], chosen[0] + chosen[1] * noise)

@@ -1,0 +1,190 @@
+"""The β-VAE's two halves, f_enc and f_dec (supplement, section 1.1.1)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
+from torch import Tensor, nn
+from torch.distributions import Normal
+from torchrl.modules import NormalParamExtractor
+
+from ls3_torchrl._checks import require_at_least, require_finite, require_keys
+
+IMAGE_SIZE = 64
+_FEATURES = 256
+
+
+def as_unit_pixels(pixels: Tensor, channels: int) -> Tensor:
+    """Images as float32 in [0, 1].
+
+    Args:
+        pixels: ``[*B, C, 64, 64]``, uint8 in 0…255, or floating point already in [0, 1].
+        channels: the C that is expected.
+
+    Raises:
+        ValueError: for another shape, or floats that are not finite.
+        TypeError: for another dtype.
+    """
+    if pixels.ndim < 3 or tuple(pixels.shape[-3:]) != (channels, IMAGE_SIZE, IMAGE_SIZE):
+        raise ValueError(
+            f"Pixels must have shape [*B, {channels}, {IMAGE_SIZE}, {IMAGE_SIZE}] (channels first), "
+            f"got {list(pixels.shape)}. Resize or permute the images, or build the encoder with in_channels "
+            "= 3 x stacked frames."
+        )
+    if pixels.dtype == torch.uint8:
+        return pixels.float() / 255.0
+    if pixels.is_floating_point():
+        require_finite(pixels, "The image batch")
+        return pixels.float()
+    raise TypeError(f"Pixels must be uint8 in 0..255 or floating point in [0, 1], got {pixels.dtype}.")
+
+
+class _ConvolutionalPosterior(nn.Module):
+    """Images to the mean and standard deviation of q(z|s)."""
+
+    def __init__(self, in_channels: int, latent_dim: int, min_scale: float) -> None:
+        super().__init__()
+        self.in_channels = in_channels
+        # Hafner et al.'s encoder with stride 3 in the second layer: 64 -> 31 -> 10 -> 4 -> 1.
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(in_channels, 32, 4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, 4, stride=3),
+            nn.ReLU(),
+            nn.Conv2d(64, 128, 4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(128, _FEATURES, 4, stride=2),
+            nn.ReLU(),
+            nn.Flatten(),
+        )
+        self.head = nn.Linear(_FEATURES, 2 * latent_dim)
+        self.to_params = NormalParamExtractor(scale_mapping="exp", scale_lb=min_scale)
+
+    def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        images = as_unit_pixels(pixels, self.in_channels)
+        batch = images.shape[:-3]
+        images = images.reshape(-1, *images.shape[-3:]).contiguous(memory_format=torch.channels_last)
+        loc, scale = self.to_params(self.head(self.convolutions(images)).float())
+        return loc.reshape(*batch, -1), scale.reshape(*batch, -1)
+
+
+class PixelEncoder(ProbabilisticTensorDictSequential):
+    """f_enc: images to a diagonal Gaussian over latents, q(z|s) = N(loc, scale²) (equation (1)).
+
+    Convolutions of 32, 64, 128 and 256 channels (kernel 4, strides 2, 3, 2, 2), then one linear layer.
+    The written latent follows tensordict's interaction type: the mean by default, a reparameterised sample
+    under ``set_interaction_type(InteractionType.RANDOM)``. ``get_dist(td)`` gives the distribution.
+
+    Args:
+        in_channels: C, 3 × stacked frames.
+        latent_dim: D, size of the latent (Table 1: 32).
+        min_scale: lower bound of the posterior's standard deviation.
+        pixels_key: where images ``[*B, C, 64, 64]`` are read, uint8 or floats in [0, 1].
+        loc_key: where the mean ``[*B, D]`` is written.
+        scale_key: where the standard deviation ``[*B, D]`` is written.
+        latent_key: where the latent ``[*B, D]`` is written.
+
+    Raises:
+        ValueError: for a wrong image shape or images that are not finite.
+        TypeError: for a dtype other than uint8 and floating point.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> encoder = PixelEncoder(latent_dim=8)
+        >>> td = TensorDict({"pixels": torch.zeros(5, 3, 64, 64, dtype=torch.uint8)}, [5])
+        >>> encoder(td)["latent"].shape
+        torch.Size([5, 8])
+    """
+
+    def __init__(
+        self,
+        in_channels: int = 3,
+        latent_dim: int = 32,
+        *,
+        min_scale: float = 1e-4,
+        pixels_key: NestedKey = "pixels",
+        loc_key: NestedKey = "loc",
+        scale_key: NestedKey = "scale",
+        latent_key: NestedKey = "latent",
+    ) -> None:
+        require_at_least(in_channels, 1, "in_channels")
+        require_at_least(latent_dim, 1, "latent_dim")
+        posterior = TensorDictModule(
+            _ConvolutionalPosterior(in_channels, latent_dim, min_scale),
+            in_keys=[pixels_key],
+            out_keys=[loc_key, scale_key],
+        )
+        sample = ProbabilisticTensorDictModule(
+            in_keys={"loc": loc_key, "scale": scale_key},
+            out_keys=[latent_key],
+            distribution_class=Normal,
+            default_interaction_type=InteractionType.DETERMINISTIC,
+        )
+        super().__init__(posterior, sample)
+        self.in_channels = in_channels
+        self.latent_dim = latent_dim
+        self.pixels_key, self.latent_key = pixels_key, latent_key
+        self.loc_key, self.scale_key = loc_key, scale_key
+
+
+class PixelDecoder(TensorDictModuleBase):
+    """f_dec: latents back to images (equation (1)).
+
+    Linear to 256, then transposed convolutions of 128, 64, 32 and C channels (kernels 5, 5, 6, 6, stride 2).
+    The output is not clamped: a clamp inside the loss would stop the gradient of every pixel that starts
+    below zero. Clamp to [0, 1] for viewing.
+
+    Args:
+        out_channels: C, 3 × stacked frames.
+        latent_dim: D.
+        latent_key: where latents ``[*B, D]`` are read.
+        reco_key: where images ``[*B, C, 64, 64]`` in about [0, 1] are written, float32.
+
+    Raises:
+        KeyError: when the latent is missing.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> decoder = PixelDecoder(latent_dim=8)
+        >>> decoder(TensorDict({"latent": torch.zeros(5, 8)}, [5]))["reco_pixels"].shape
+        torch.Size([5, 3, 64, 64])
+    """
+
+    def __init__(
+        self,
+        out_channels: int = 3,
+        latent_dim: int = 32,
+        *,
+        latent_key: NestedKey = "latent",
+        reco_key: NestedKey = "reco_pixels",
+    ) -> None:
+        super().__init__()
+        self.in_keys = [latent_key]
+        self.out_keys = [reco_key]
+        self.network = nn.Sequential(
+            nn.Linear(latent_dim, _FEATURES),
+            nn.Unflatten(-1, (_FEATURES, 1, 1)),
+            nn.ConvTranspose2d(_FEATURES, 128, 5, stride=2),
+            nn.ReLU(),
+            nn.ConvTranspose2d(128, 64, 5, stride=2),
+            nn.ReLU(),
+            nn.ConvTranspose2d(64, 32, 6, stride=2),
+            nn.ReLU(),
+            nn.ConvTranspose2d(32, out_channels, 6, stride=2),
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the reconstruction of the latent."""
+        require_keys(tensordict, self.in_keys, "PixelDecoder")
+        latent = tensordict.get(self.in_keys[0])
+        images = self.network(latent.reshape(-1, latent.shape[-1])).float()
+        return tensordict.set(self.out_keys[0], images.reshape(*latent.shape[:-1], *images.shape[-3:]))

@@ -1,0 +1,16 @@
+"""One loss module per equation of the paper."""
+
+from ls3_torchrl.objectives.classifier import ClassifierLoss
+from ls3_torchrl.objectives.dynamics import EnsembleDynamicsLoss
+from ls3_torchrl.objectives.safe_set import SafeSetLoss
+from ls3_torchrl.objectives.vae import VAELoss
+from ls3_torchrl.objectives.value import OfflineValueLoss, TD1ValueLoss
+
+__all__ = [
+    "ClassifierLoss",
+    "EnsembleDynamicsLoss",
+    "OfflineValueLoss",
+    "SafeSetLoss",
+    "TD1ValueLoss",
+    "VAELoss",
+]

@@ -1,0 +1,85 @@
+"""Equation (2): the probabilistic dynamics' negative log-likelihood."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tensordict import NestedKey, TensorDictBase
+from torch.distributions import Normal
+from torchrl.objectives import LossModule
+
+from ls3_torchrl._checks import require_keys
+from ls3_torchrl.modules.dynamics import EnsembleDynamics
+from ls3_torchrl.objectives._evaluate import as_scalars, check_members
+
+
+class EnsembleDynamicsLoss(LossModule):
+    """J(θ) = −log f_dyn,θ(z' | z, a), averaged over batch, members and latent dimensions (equation (2)).
+
+    Averaging over the D dimensions instead of summing them only scales the gradient, which Adam undoes.
+
+    Args:
+        dynamics: the ensemble.
+        bootstrap: the batch is ``[B, M]`` and member m learns from column m alone, as in Chua et al.;
+            otherwise it is ``[B]`` and every member sees all of it.
+
+    Returns:
+        Scalars ``loss_dynamics`` and, detached, ``prediction_error`` (mean squared error of the means).
+
+    Raises:
+        ValueError: when a bootstrap batch has not M columns.
+        KeyError: when a key is missing.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from ls3_torchrl.modules import EnsembleDynamics
+        >>> loss = EnsembleDynamicsLoss(EnsembleDynamics(8, 2))
+        >>> z = torch.zeros(4, 8)
+        >>> batch = TensorDict({"latent": z, "action": torch.zeros(4, 2), "next": {"latent": z}}, [4])
+        >>> loss(batch)["loss_dynamics"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change.
+
+        Attributes:
+            latent (NestedKey): z_t.
+            action (NestedKey): a_t.
+            next_latent (NestedKey): z_{t+1}.
+        """
+
+        latent: NestedKey = "latent"
+        action: NestedKey = "action"
+        next_latent: NestedKey = ("next", "latent")
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    dynamics: EnsembleDynamics
+
+    def __init__(self, dynamics: EnsembleDynamics, *, bootstrap: bool = False) -> None:
+        super().__init__()
+        self.dynamics = dynamics
+        self.bootstrap = bootstrap
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        pass
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The loss on transitions ``[B]``, or ``[B, M]`` with ``bootstrap``."""
+        keys = self.tensor_keys
+        require_keys(tensordict, (keys.latent, keys.action, keys.next_latent), "EnsembleDynamicsLoss")
+        latent, action = tensordict.get(keys.latent), tensordict.get(keys.action)
+        target = tensordict.get(keys.next_latent)
+        if self.bootstrap:
+            check_members(latent, self.dynamics.num_members, "EnsembleDynamicsLoss")
+        else:
+            target = target.unsqueeze(-2)
+        loc, scale = self.dynamics.distribution(latent, action, per_member=self.bootstrap)
+        target = target.expand_as(loc)
+        return as_scalars(
+            loss_dynamics=-Normal(loc, scale).log_prob(target).mean(),
+            prediction_error=(loc.detach() - target).square().mean(),
+        )

@@ -1,0 +1,86 @@
+"""Equation (5): the safe set's Bellman-style loss."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
+from torchrl.objectives import LossModule
+
+from ls3_torchrl._checks import require_keys
+from ls3_torchrl.modules.classifiers import SafeSet
+from ls3_torchrl.objectives._evaluate import as_scalars, evaluate
+from ls3_torchrl.objectives.value import check_discount
+
+
+class SafeSetLoss(LossModule):
+    """Binary cross-entropy of f_S(z_t) to max(1_S(z_t), γ_S f_S'(z_{t+1})) (equation (5)).
+
+    The target is built by a lagged copy f_S' of the safe set itself: fixed-point iteration. Couple it with
+    ``HardUpdate(loss, value_network_update_interval=99)`` for a copy every 100 updates.
+
+    Args:
+        safe_set: writes the logit of f_S.
+        gamma: γ_S in [0, 1] (Table 1: 0.3 for Navigation and Reacher, 0.9 for the others).
+
+    Returns:
+        The scalar ``loss_safe_set``.
+
+    Raises:
+        ValueError: for γ_S outside [0, 1].
+        KeyError: when a key is missing.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from ls3_torchrl.modules import SafeSet
+        >>> loss = SafeSetLoss(SafeSet(8))
+        >>> z, label = torch.zeros(4, 8), torch.ones(4, 1, dtype=torch.bool)
+        >>> batch = TensorDict({"latent": z, "in_success": label, "next": {"latent": z}}, [4])
+        >>> loss(batch)["loss_safe_set"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change.
+
+        Attributes:
+            latent (NestedKey): z_t.
+            next_latent (NestedKey): z_{t+1}.
+            in_success (NestedKey): 1_S(z_t), the state is part of a trajectory that still succeeds.
+        """
+
+        latent: NestedKey = "latent"
+        next_latent: NestedKey = ("next", "latent")
+        in_success: NestedKey = "in_success"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    safe_set: SafeSet
+
+    def __init__(self, safe_set: SafeSet, *, gamma: float = 0.3) -> None:
+        super().__init__()
+        self.convert_to_functional(safe_set, "safe_set", create_target_params=True)
+        self.gamma = check_discount(gamma, "gamma (of the safe set)")
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        pass
+
+    def target(self, next_latent: Tensor, in_success: Tensor) -> Tensor:
+        """max(1_S(z_t), γ_S f_S'(z_{t+1})), a probability ``[B, 1]``."""
+        with torch.no_grad(), self.target_safe_set_params.to_module(self.safe_set):
+            next_safe = evaluate(self.safe_set, next_latent).sigmoid()
+        return torch.maximum(in_success.to(next_safe), self.gamma * next_safe)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The loss on transitions ``[B]``."""
+        keys = self.tensor_keys
+        require_keys(tensordict, (keys.latent, keys.next_latent, keys.in_success), "SafeSetLoss")
+        target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.in_success))
+        with self.safe_set_params.to_module(self.safe_set):
+            logit = evaluate(self.safe_set, tensordict.get(keys.latent))
+        return as_scalars(loss_safe_set=binary_cross_entropy_with_logits(logit, target))

@@ -1,0 +1,177 @@
+"""Equations (3) and (4): the value ensemble's losses, offline and online."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.objectives import LossModule
+from torchrl.objectives.value.functional import td0_return_estimate
+
+from ls3_torchrl._checks import require_keys
+from ls3_torchrl.modules.value import ValueEnsemble
+from ls3_torchrl.objectives._evaluate import as_scalars, check_members, evaluate
+
+
+def check_discount(gamma: float, name: str = "gamma") -> float:
+    """Return a discount factor in [0, 1]; raise ``ValueError`` for another."""
+    if not 0.0 <= gamma <= 1.0:
+        raise ValueError(f"{name} must lie in [0, 1], got {gamma}.")
+    return float(gamma)
+
+
+class OfflineValueLoss(LossModule):
+    """J(θ) = (V_θ(z_t) − Σ_{i≥0} γ^i r_{t+i})² over batch and members (equation (3)).
+
+    Deviation: the paper's sum starts at i = 1. It starts at 0 here, so that it agrees with equation (4) and
+    the switch from one loss to the other moves nothing.
+
+    Args:
+        value: the ensemble.
+        bootstrap: the batch is ``[B, M]`` and member m learns from column m alone.
+
+    Returns:
+        The scalar ``loss_value``.
+
+    Raises:
+        ValueError: when a bootstrap batch has not M columns.
+        KeyError: when a key is missing.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from ls3_torchrl.modules import ValueEnsemble
+        >>> loss = OfflineValueLoss(ValueEnsemble(8))
+        >>> batch = TensorDict({"latent": torch.zeros(4, 8), "reward_to_go": torch.full((4, 1), -3.0)}, [4])
+        >>> loss(batch)["loss_value"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change.
+
+        Attributes:
+            latent (NestedKey): z_t.
+            reward_to_go (NestedKey): discounted sum of the rewards from step t on.
+        """
+
+        latent: NestedKey = "latent"
+        reward_to_go: NestedKey = "reward_to_go"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    value: ValueEnsemble
+
+    def __init__(self, value: ValueEnsemble, *, bootstrap: bool = False) -> None:
+        super().__init__()
+        self.value = value
+        self.bootstrap = bootstrap
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        pass
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The loss on states ``[B]``, or ``[B, M]`` with ``bootstrap``."""
+        keys = self.tensor_keys
+        require_keys(tensordict, (keys.latent, keys.reward_to_go), "OfflineValueLoss")
+        latent, target = tensordict.get(keys.latent), tensordict.get(keys.reward_to_go)
+        if self.bootstrap:
+            check_members(latent, self.value.num_members, "OfflineValueLoss")
+        else:
+            target = target.unsqueeze(-2)
+        value = evaluate(self.value, latent, per_member=self.bootstrap)
+        return as_scalars(loss_value=(value - target).square().mean())
+
+
+class TD1ValueLoss(LossModule):
+    """J(θ) = (V_θ(z_t) − (r_t + γ V_θ'(z_{t+1})))² with a lagged target θ' (equation (4)).
+
+    No ``done`` mask: episodes end only by the horizon (section 1.1.1). Each member bootstraps from its own
+    lagged copy. Couple it with ``HardUpdate(loss, value_network_update_interval=99)`` for a copy every 100
+    updates.
+
+    Args:
+        value: the ensemble.
+        gamma: γ in [0, 1] (Table 1: 0.99).
+        zero_at_goal: the target is 0 where the reward is 0, since the agent may stay in the goal set; this is
+            what the authors' code does.
+        bootstrap: the batch is ``[B, M]`` and member m learns from column m alone.
+
+    Returns:
+        The scalar ``loss_value``.
+
+    Raises:
+        ValueError: for γ outside [0, 1] or a bootstrap batch without M columns.
+        KeyError: when a key is missing.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from ls3_torchrl.modules import ValueEnsemble
+        >>> loss = TD1ValueLoss(ValueEnsemble(8))
+        >>> next_step = {"latent": torch.zeros(4, 8), "reward": -torch.ones(4, 1)}
+        >>> batch = TensorDict({"latent": torch.zeros(4, 8), "next": next_step}, [4])
+        >>> loss(batch)["loss_value"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change.
+
+        Attributes:
+            latent (NestedKey): z_t.
+            next_latent (NestedKey): z_{t+1}.
+            reward (NestedKey): r_t, the reward of the step from t.
+        """
+
+        latent: NestedKey = "latent"
+        next_latent: NestedKey = ("next", "latent")
+        reward: NestedKey = ("next", "reward")
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    value: ValueEnsemble
+
+    def __init__(
+        self,
+        value: ValueEnsemble,
+        *,
+        gamma: float = 0.99,
+        zero_at_goal: bool = True,
+        bootstrap: bool = False,
+    ) -> None:
+        super().__init__()
+        self.convert_to_functional(value, "value", create_target_params=True)
+        self.num_members = value.num_members
+        self.gamma = check_discount(gamma)
+        self.zero_at_goal = zero_at_goal
+        self.bootstrap = bootstrap
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        pass
+
+    def target(self, next_latent: Tensor, reward: Tensor) -> Tensor:
+        """r_t + γ V_θ'(z_{t+1}) of every member, ``[B, M, 1]``."""
+        with torch.no_grad(), self.target_value_params.to_module(self.value):
+            next_value = evaluate(self.value, next_latent, per_member=self.bootstrap)
+        reward = reward if self.bootstrap else reward.unsqueeze(-2)
+        reward = reward.expand_as(next_value)
+        never = torch.zeros_like(reward, dtype=torch.bool)
+        target = td0_return_estimate(self.gamma, next_value, reward, terminated=never)
+        return torch.where(reward == 0, torch.zeros_like(target), target) if self.zero_at_goal else target
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The loss on transitions ``[B]``, or ``[B, M]`` with ``bootstrap``."""
+        keys = self.tensor_keys
+        require_keys(tensordict, (keys.latent, keys.next_latent, keys.reward), "TD1ValueLoss")
+        latent = tensordict.get(keys.latent)
+        if self.bootstrap:
+            check_members(latent, self.num_members, "TD1ValueLoss")
+        target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.reward))
+        with self.value_params.to_module(self.value):
+            value = evaluate(self.value, latent, per_member=self.bootstrap)
+        return as_scalars(loss_value=(value - target).square().mean())
