@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictParams
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 from torchrl.objectives import LossModule
@@ -37,7 +38,9 @@ class SafeSetLoss(LossModule):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from ls3_torchrl.modules import SafeSet
+        >>> from torchrl.objectives import HardUpdate
         >>> loss = SafeSetLoss(SafeSet(8))
+        >>> updater = HardUpdate(loss, value_network_update_interval=99)
         >>> z, label = torch.zeros(4, 8), torch.ones(4, 1, dtype=torch.bool)
         >>> batch = TensorDict({"latent": z, "in_success": label, "next": {"latent": z}}, [4])
         >>> loss(batch)["loss_safe_set"].backward()
@@ -61,6 +64,8 @@ class SafeSetLoss(LossModule):
     default_keys = _AcceptedKeys
 
     safe_set: SafeSet
+    safe_set_params: TensorDictParams
+    target_safe_set_params: TensorDictParams
 
     def __init__(self, safe_set: SafeSet, *, gamma: float = 0.3) -> None:
         super().__init__()

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictParams
 from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import td0_return_estimate
@@ -111,7 +112,9 @@ class TD1ValueLoss(LossModule):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from ls3_torchrl.modules import ValueEnsemble
+        >>> from torchrl.objectives import HardUpdate
         >>> loss = TD1ValueLoss(ValueEnsemble(8))
+        >>> updater = HardUpdate(loss, value_network_update_interval=99)
         >>> next_step = {"latent": torch.zeros(4, 8), "reward": -torch.ones(4, 1)}
         >>> batch = TensorDict({"latent": torch.zeros(4, 8), "next": next_step}, [4])
         >>> loss(batch)["loss_value"].backward()
@@ -135,6 +138,8 @@ class TD1ValueLoss(LossModule):
     default_keys = _AcceptedKeys
 
     value: ValueEnsemble
+    value_params: TensorDictParams
+    target_value_params: TensorDictParams
 
     def __init__(
         self,

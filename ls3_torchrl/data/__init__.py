@@ -1,0 +1,22 @@
+"""The data path: tags, labels, the two-store buffer, augmentation and files."""
+
+from ls3_torchrl.data.augment import random_resized_crop
+from ls3_torchrl.data.buffer import TaggedReplayBuffer
+from ls3_torchrl.data.dataset import check_episodes, load_episodes, save_episodes
+from ls3_torchrl.data.labels import in_success, reward_to_go
+from ls3_torchrl.data.sampler import TagSampler
+from ls3_torchrl.data.tags import ALL_TAGS, VALUE_TAGS, Tag
+
+__all__ = [
+    "ALL_TAGS",
+    "VALUE_TAGS",
+    "Tag",
+    "TagSampler",
+    "TaggedReplayBuffer",
+    "check_episodes",
+    "in_success",
+    "load_episodes",
+    "random_resized_crop",
+    "reward_to_go",
+    "save_episodes",
+]

@@ -1,0 +1,245 @@
+"""The replay buffer: a pixel store for the VAE, a latent store for everything else, views by tag."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import (
+    ImmutableDatasetWriter,
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    TensorDictReplayBuffer,
+)
+from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.data.replay_buffers.storages import Storage
+
+from ls3_torchrl._checks import require_at_least, require_finite, require_keys
+from ls3_torchrl.data.labels import in_success, reward_to_go
+from ls3_torchrl.data.sampler import TagSampler
+from ls3_torchrl.data.tags import ALL_TAGS, Tag
+from ls3_torchrl.modules.vae import PixelEncoder
+
+
+class TaggedReplayBuffer:
+    """Episodes in two stores: every frame's image once, and every transition with its latents and labels.
+
+    Latents are kept as posteriors (``loc``, ``scale``) and drawn afresh whenever a row is sampled. Before an
+    encoder is known only the pixel store can be sampled; :meth:`encode` fills the latents of all rows and
+    keeps the encoder for the rows to come.
+
+    Args:
+        capacity: transitions kept; the oldest are overwritten.
+        latent_dim: D.
+        gamma: γ of the ``reward_to_go`` labels.
+        pixel_capacity: frames kept; ``None`` makes room for the same episodes, frames at both ends included.
+        scratch_dir: memory-map both stores below this folder instead of holding them in memory.
+        device: where sampled batches live.
+
+    Raises:
+        ValueError: for a capacity below 1, or (in :meth:`add`) data that are not finite.
+        KeyError: in :meth:`add`, for a missing key.
+        RuntimeError: in :meth:`sample`, without encoder or without rows of the tags; in :meth:`encode`, when
+            frames were overwritten.
+
+    Example:
+        >>> from ls3_torchrl.modules import PixelEncoder
+        >>> step = {"reward": -torch.ones(9, 1), "pixels": torch.zeros(9, 3, 64, 64, dtype=torch.uint8)}
+        >>> step |= {k: torch.zeros(9, 1, dtype=torch.bool) for k in ("constraint", "success")}
+        >>> episode = TensorDict({"pixels": step["pixels"], "action": torch.zeros(9, 2), "next": step}, [9])
+        >>> buffer = TaggedReplayBuffer(capacity=100, latent_dim=8)
+        >>> buffer.add(episode, "success")
+        >>> buffer.sample_pixels(4)["pixels"].shape
+        torch.Size([4, 3, 64, 64])
+        >>> buffer.encode(PixelEncoder(latent_dim=8))
+        >>> buffer.sample(4, tags=["success"])["next", "latent"].shape
+        torch.Size([4, 8])
+        >>> buffer.sample(4, tags=["success"], members=5)["latent"].shape
+        torch.Size([4, 5, 8])
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        *,
+        latent_dim: int = 32,
+        gamma: float = 0.99,
+        pixel_capacity: int | None = None,
+        scratch_dir: str | Path | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.capacity = require_at_least(capacity, 1, "capacity")
+        # An episode of T transitions has T + 1 frames; episodes of fewer than 16 steps need more room.
+        room = capacity + capacity // 16 + 64 if pixel_capacity is None else pixel_capacity
+        self.pixel_capacity = require_at_least(room, 2, "pixel_capacity")
+        self.latent_dim = require_at_least(latent_dim, 1, "latent_dim")
+        self.gamma = gamma
+        self.device = torch.device(device)
+        folder = None if scratch_dir is None else Path(scratch_dir)
+
+        def storage(size: int, name: str) -> Storage:
+            if folder is None:
+                return LazyTensorStorage(size, device=self.device)
+            return LazyMemmapStorage(size, scratch_dir=str(folder / name))
+
+        self.pixels = TensorDictReplayBuffer(
+            storage=storage(self.pixel_capacity, "pixels"), sampler=RandomSampler()
+        )
+        self.latents = TensorDictReplayBuffer(
+            storage=storage(self.capacity, "latents"), sampler=RandomSampler()
+        )
+        self._views: dict[tuple[Tag, ...], TensorDictReplayBuffer] = {}
+        self._encoder: PixelEncoder | None = None
+        self._frames_written = 0
+
+    def __len__(self) -> int:
+        return len(self.latents)
+
+    def add(self, episodes: TensorDictBase, tag: Tag | str) -> None:
+        """Label and store whole episodes.
+
+        Args:
+            episodes: ``[T]`` or ``[N, T]`` with ``pixels``, ``action`` and, under ``next``, ``pixels``,
+                ``reward``, ``constraint`` and ``success``; each row one episode from its first step on.
+            tag: where they come from.
+        """
+        tag = Tag.parse(tag)
+        needed = ("pixels", "action", *(("next", k) for k in ("pixels", "reward", "constraint", "success")))
+        require_keys(episodes, needed, "TaggedReplayBuffer.add")
+        if episodes.ndim not in (1, 2):
+            raise ValueError(f"Episodes must have batch size [T] or [N, T], got {list(episodes.shape)}.")
+        for episode in episodes.unbind(0) if episodes.ndim == 2 else [episodes]:
+            self._add_one(episode, tag)
+        for view in self._views.values():
+            view.sampler.refresh()
+
+    def _add_one(self, episode: TensorDictBase, tag: Tag) -> None:
+        steps = episode.shape[0]
+        if steps + 1 > self.pixel_capacity or steps > self.capacity:
+            raise ValueError(
+                f"An episode of {steps} steps does not fit a buffer of {self.capacity} transitions and "
+                f"{self.pixel_capacity} frames. Raise capacity."
+            )
+        require_finite(episode.get("action"), "The episode's action")
+        require_finite(episode.get(("next", "reward")), "The episode's reward")
+        frames = torch.cat([episode["pixels"], episode["next", "pixels"][-1:]])
+        first = self._frames_written
+        self._frames_written += steps + 1
+        self.pixels.extend(TensorDict({"pixels": frames}, [steps + 1]))
+        reward, success = episode["next", "reward"], episode["next", "success"]
+        rows = TensorDict(
+            {
+                "action": episode["action"],
+                "tag": torch.full((steps, 1), int(tag), dtype=torch.uint8),
+                "in_success": in_success(success),
+                "reward_to_go": reward_to_go(reward, self.gamma),
+                "frame": first + torch.arange(steps).unsqueeze(-1),
+                "next": {
+                    "reward": reward,
+                    "constraint": episode["next", "constraint"],
+                    "success": success,
+                },
+            },
+            [steps],
+        )
+        if self._encoder is None:
+            blank = torch.zeros(steps + 1, self.latent_dim)
+            posteriors = TensorDict({"loc": blank, "scale": blank}, [steps + 1])
+        else:
+            posteriors = self._encode_frames(frames)
+        for key in ("loc", "scale"):
+            rows[key] = posteriors[key][:-1]
+            rows["next", key] = posteriors[key][1:]
+        self.latents.extend(rows)
+
+    def encode(self, encoder: PixelEncoder, *, progress: Callable[[int, int], None] | None = None) -> None:
+        """Fill the latents of all rows, and encode the rows to come with the same, frozen encoder.
+
+        Args:
+            encoder: the trained f_enc.
+            progress: called with (frames done, frames in all).
+        """
+        rows = self.latents.storage[:] if len(self) else None
+        self._encoder = encoder
+        if rows is None:
+            return
+        oldest = self._frames_written - len(self.pixels)
+        if int(rows["frame"].min()) < oldest:
+            raise RuntimeError(
+                f"Frames older than number {oldest} were overwritten, but transitions still need frame "
+                f"{int(rows['frame'].min())}. Give the buffer a larger pixel_capacity (now {self.pixel_capacity})."
+            )
+        stored = self.pixels.storage[:]["pixels"]
+        posteriors = self._encode_frames(stored, progress)
+        slot = (rows["frame"].flatten() % self.pixel_capacity).to(posteriors.device)
+        after = (slot + 1) % self.pixel_capacity
+        for key in ("loc", "scale"):  # in place: the rows are a view of the storage
+            rows.get(key).copy_(posteriors[key][slot])
+            rows.get(("next", key)).copy_(posteriors[key][after])
+
+    def _encode_frames(
+        self, frames: torch.Tensor, progress: Callable[[int, int], None] | None = None, chunk: int = 512
+    ) -> TensorDict:
+        encoder = self._encoder
+        assert encoder is not None
+        weight = next(encoder.parameters())
+        parts = []
+        with torch.no_grad():
+            for start in range(0, len(frames), chunk):
+                part = TensorDict({encoder.pixels_key: frames[start : start + chunk].to(weight.device)})
+                encoder[0](part)
+                parts.append((part.get(encoder.loc_key), part.get(encoder.scale_key)))
+                if progress is not None:
+                    progress(min(start + chunk, len(frames)), len(frames))
+        loc, scale = (torch.cat(values).to(self.device) for values in zip(*parts, strict=True))
+        if loc.shape[-1] != self.latent_dim:
+            raise ValueError(
+                f"The encoder writes latents of size {loc.shape[-1]}, but the buffer was made with "
+                f"latent_dim={self.latent_dim}. Give both the same size."
+            )
+        return TensorDict({"loc": loc, "scale": scale}, [len(frames)])
+
+    def view(self, tags: Iterable[Tag | str] = ALL_TAGS) -> TensorDictReplayBuffer:
+        """A TorchRL buffer on the same latent store that samples from the union of ``tags``."""
+        key = tuple(sorted({Tag.parse(tag) for tag in tags}))
+        if key not in self._views:
+            self._views[key] = TensorDictReplayBuffer(
+                storage=self.latents.storage,
+                sampler=TagSampler(key),
+                writer=ImmutableDatasetWriter(),
+            )
+        return self._views[key]
+
+    def count(self, tags: Iterable[Tag | str] = ALL_TAGS) -> int:
+        """How many transitions carry one of the tags."""
+        view = self.view(tags)
+        return int(view.sampler.rows(view.storage).numel())
+
+    def sample(
+        self, batch_size: int, *, tags: Iterable[Tag | str] = ALL_TAGS, members: int | None = None
+    ) -> TensorDictBase:
+        """Transitions with freshly drawn latents, uniformly from the union of the tags.
+
+        Args:
+            batch_size: B.
+            tags: what to draw from.
+            members: M for a bootstrap: B transitions drawn independently for each of M members.
+
+        Returns:
+            ``[B]``, or ``[B, M]``, with ``latent`` and ``("next", "latent")`` drawn from the posteriors.
+        """
+        if self._encoder is None:
+            raise RuntimeError("The buffer has no latents yet: call buffer.encode(encoder) after training the VAE.")
+        rows = self.view(tags).sample(batch_size * (members or 1))
+        for group in (rows, rows.get("next")):
+            loc = group.get("loc")
+            group.set("latent", torch.addcmul(loc, group.get("scale"), torch.randn_like(loc)))
+        return rows if members is None else rows.reshape(batch_size, members)
+
+    def sample_pixels(self, batch_size: int) -> TensorDictBase:
+        """Images ``pixels`` ``[B, C, 64, 64]``, uint8, uniformly from all frames."""
+        if len(self.pixels) == 0:
+            raise RuntimeError("The buffer holds no images yet: add episodes first.")
+        return self.pixels.sample(batch_size)

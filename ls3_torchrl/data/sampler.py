@@ -1,0 +1,100 @@
+"""Uniform sampling from the rows that carry given tags."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.storages import Storage
+
+from ls3_torchrl.data.tags import Tag
+
+
+class TagSampler(Sampler):
+    """Draws rows with replacement, uniformly over the union of some tags.
+
+    The indices are cached, since a scan of the tags costs more than a draw: call :meth:`refresh` after rows
+    were written or relabelled (:class:`~ls3_torchrl.data.TaggedReplayBuffer` does).
+
+    Args:
+        tags: the union to draw from.
+        tag_key: where the rows keep their tag, uint8 ``[1]``.
+
+    Raises:
+        RuntimeError: when no row carries one of the tags.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> buffer = TensorDictReplayBuffer(
+        ...     storage=LazyTensorStorage(8), sampler=TagSampler([Tag.RAND]), batch_size=3
+        ... )
+        >>> _ = buffer.extend(TensorDict({"tag": torch.tensor([[0], [1]], dtype=torch.uint8)}, [2]))
+        >>> buffer.sample()["tag"].flatten().tolist()
+        [1, 1, 1]
+    """
+
+    def __init__(self, tags: Iterable[Tag | str], *, tag_key: NestedKey = "tag") -> None:
+        super().__init__()
+        self.tags = tuple(sorted({Tag.parse(tag) for tag in tags}))
+        if not self.tags:
+            raise ValueError("A TagSampler needs at least one tag; none was given.")
+        self.tag_key = tag_key
+        self._rows: Tensor | None = None
+
+    def refresh(self) -> None:
+        """Forget the cached indices."""
+        self._rows = None
+
+    def rows(self, storage: Storage) -> Tensor:
+        """Indices of the rows with one of the tags, int64 ``[n]``."""
+        if self._rows is None:
+            if len(storage) == 0:
+                self._rows = torch.zeros(0, dtype=torch.long)
+            else:
+                tag = storage[:].get(self.tag_key).flatten()
+                wanted = torch.tensor(self.tags, dtype=tag.dtype, device=tag.device)
+                self._rows = torch.isin(tag, wanted).nonzero().flatten()
+        return self._rows
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
+        """Indices ``[batch_size]``."""
+        rows = self.rows(storage)
+        if rows.numel() == 0:
+            names = ", ".join(repr(tag.name.lower()) for tag in self.tags)
+            raise RuntimeError(
+                f"The buffer ({len(storage)} rows) holds no data tagged {names}. "
+                "Collect such episodes and add them with that tag before training what learns from them."
+            )
+        return rows[torch.randint(rows.numel(), (batch_size,), device=rows.device)], {}
+
+    def add(self, index: int) -> None:
+        """A row was written."""
+        self.refresh()
+
+    def extend(self, index: Tensor) -> None:
+        """Rows were written."""
+        self.refresh()
+
+    def _empty(self) -> None:
+        self.refresh()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: the indices follow from the storage."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Forget the cached indices."""
+        self.refresh()
+
+    def dumps(self, path: str) -> None:
+        """Nothing to write."""
+
+    def loads(self, path: str) -> None:
+        """Nothing to read."""
+        self.refresh()
