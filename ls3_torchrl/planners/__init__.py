@@ -1,0 +1,25 @@
+"""Planning: the learned model as an environment, the optimiser, the scores, and LS³'s controller."""
+
+from ls3_torchrl.planners.cem import CEMResult, CrossEntropyMethod, Judgement
+from ls3_torchrl.planners.fused import FusedImagination
+from ls3_torchrl.planners.imagination import ImaginationNoise, RolloutImagination
+from ls3_torchrl.planners.latent_env import LatentEnv
+from ls3_torchrl.planners.ls3 import LS3Planner, PlanNoise, describe_plan
+from ls3_torchrl.planners.scoring import PlanStatistics, feasible, least_harm, objective
+
+__all__ = [
+    "CEMResult",
+    "CrossEntropyMethod",
+    "FusedImagination",
+    "ImaginationNoise",
+    "Judgement",
+    "LS3Planner",
+    "LatentEnv",
+    "PlanNoise",
+    "PlanStatistics",
+    "RolloutImagination",
+    "describe_plan",
+    "feasible",
+    "least_harm",
+    "objective",
+]
