@@ -192,13 +192,11 @@ class LS3Planner(MPCPlannerBase):
     def primer(self) -> TensorDictPrimer:
         """The transform that carries the warm start from step to step and resets it with the episode."""
         shape = (self.horizon, self.action_spec.shape[-1])
-        low, high = self.action_spec.space.low, self.action_spec.space.high
         spec = Composite()
         for name in ("mean", "std"):
             spec[self._plan(name)] = Unbounded(shape=shape, device=self.action_spec.device)
-        start = {"mean": (low + high) / 2, "std": (high - low) / 4}
-        defaults = {self._plan(name): value.expand(shape).clone() for name, value in start.items()}
-        return TensorDictPrimer(spec, default_value=defaults, expand_specs=True)
+        # Zeros: a warm start without any spread is none (a shifted plan always has some at its open end).
+        return TensorDictPrimer(spec, default_value=0.0, expand_specs=True)
 
     def draw_noise(self, batch: int) -> PlanNoise:
         """All noise that a plan for ``batch`` rows can need; large, meant for tests and comparisons."""
@@ -299,9 +297,10 @@ class LS3Planner(MPCPlannerBase):
         mean = mean.reshape(rows, *mean.shape[-2:])
         std = std.reshape(rows, *std.shape[-2:])
         is_init = tensordict.get(self.is_init_key, None)
+        fresh = (std == 0).all(-1, keepdim=True).all(-2, keepdim=True)
         if is_init is not None:
-            fresh = is_init.reshape(rows, 1, 1)
-            mean, std = torch.where(fresh, middle, mean), torch.where(fresh, wide, std)
+            fresh = fresh | is_init.reshape(rows, 1, 1)
+        mean, std = torch.where(fresh, middle, mean), torch.where(fresh, wide, std)
         return mean, std
 
     def planning(self, td: TensorDictBase, noise: PlanNoise | None = None) -> Tensor:

@@ -1,0 +1,61 @@
+"""Environments as the recipes use them, demonstrations, and episodes of a trained agent."""
+
+from __future__ import annotations
+
+import ls3_envs
+import torch
+from common import progress
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.envs import InitTracker, TransformedEnv
+
+from ls3_torchrl import LS3Agent
+from ls3_torchrl.data import Tag
+from ls3_torchrl.planners import LS3Planner
+
+
+def make_env(config: DictConfig, worlds: int, seed: int, device: torch.device) -> TransformedEnv:
+    """The task's environment with ``worlds`` worlds and marks at the starts of episodes."""
+    options = {"horizon": config.task.horizon} if "horizon" in config.task else {}
+    env = ls3_envs.make(config.task.name, num_worlds=worlds, seed=seed, device=device, **options)
+    return TransformedEnv(env, InitTracker())
+
+
+def collect_demonstrations(config: DictConfig, seed: int) -> dict[Tag, TensorDictBase]:
+    """The task's offline data by tag; as many episodes as the paper, or ``task.offline_episodes`` of each."""
+    kinds = ls3_envs.domain(config.task.name).offline
+    datasets = {}
+    for i, kind in enumerate(progress_over(kinds, "Demonstrations")):
+        datasets[Tag.parse(kind)] = ls3_envs.collect_offline(
+            config.task.name, kind, episodes=config.task.get("offline_episodes"), seed=seed + i
+        )
+    return datasets
+
+
+def progress_over(items, what: str):  # noqa: ANN001, ANN201
+    """Iterate with a progress bar."""
+    with progress(len(items), what, "set") as bar:
+        for item in items:
+            yield item
+            bar.update()
+
+
+def run_episodes(
+    config: DictConfig,
+    agent: LS3Agent,
+    planner: LS3Planner,
+    episodes: int,
+    seed: int,
+    device: torch.device,
+    *,
+    what: str,
+) -> TensorDictBase:
+    """Whole episodes ``[N, T]`` of the agent, side by side in as many worlds."""
+    env = make_env(config, episodes, seed, device)
+    env.append_transform(planner.primer())
+    horizon = env.base_env.horizon
+    with progress(horizon, what) as bar, torch.no_grad():
+        ticking = planner.register_forward_hook(lambda *_: bar.update())
+        out = env.rollout(horizon, planner, break_when_any_done=False)
+        ticking.remove()
+    return out.cpu()

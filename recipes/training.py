@@ -1,0 +1,187 @@
+"""The phases of LS³'s learning: VAE, offline models, online updates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from common import RunFolder, progress
+from omegaconf import DictConfig
+from tensordict import TensorDict, TensorDictBase
+from torchrl.objectives import HardUpdate, LossModule
+
+from ls3_torchrl import LS3Agent
+from ls3_torchrl.data import ALL_TAGS, VALUE_TAGS, TaggedReplayBuffer, random_resized_crop
+from ls3_torchrl.objectives import (
+    ClassifierLoss,
+    EnsembleDynamicsLoss,
+    OfflineValueLoss,
+    SafeSetLoss,
+    TD1ValueLoss,
+    VAELoss,
+)
+
+LOG_EVERY = 100
+
+
+class Learner:
+    """One loss, its optimiser, its lagged target and where its batches come from.
+
+    Args:
+        name: the loss is ``loss_{name}``.
+        loss: a TorchRL loss module.
+        sample: draws a batch.
+        lr: Adam's learning rate.
+        target_interval: gradient steps between copies to the target network; ``None`` without one.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        loss: LossModule,
+        sample: Callable[[], TensorDictBase],
+        *,
+        lr: float,
+        target_interval: int | None = None,
+    ) -> None:
+        self.name, self.loss, self.sample = name, loss, sample
+        self.parameters = [p for p in loss.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True)
+        # HardUpdate copies at calls k + 1, 2(k + 1), …: one less than the interval that is meant.
+        self.target = (
+            None
+            if target_interval is None
+            else HardUpdate(loss, value_network_update_interval=target_interval - 1)
+        )
+        self.steps = 0
+
+    def train(self, steps: int, what: str, run: RunFolder) -> None:
+        """Take ``steps`` gradient steps."""
+        with progress(steps, what) as bar:
+            for i in range(steps):
+                losses = self.loss(self.sample())
+                value = losses[f"loss_{self.name}"]
+                self.optimizer.zero_grad()
+                value.backward()
+                self.optimizer.step()
+                if self.target is not None:
+                    self.target.step()
+                self.steps += 1
+                if i % LOG_EVERY == 0 or i == steps - 1:
+                    scalars = {key: item.item() for key, item in losses.items()}
+                    if not all(map(torch.isfinite, losses.values())):
+                        raise FloatingPointError(
+                            f"{what} diverged: {scalars} at step {self.steps}. Lower its learning rate."
+                        )
+                    bar.set_postfix_str(f"loss {value.item():.4g}", refresh=False)
+                    run.log(what, self.steps, **scalars)
+                bar.update()
+
+
+class Training:
+    """All learners of an agent on one buffer, and the phases in the paper's order.
+
+    Args:
+        agent: its networks are trained in place.
+        buffer: filled with the offline data.
+        config: the recipe's configuration.
+        run: where metrics go.
+    """
+
+    def __init__(self, agent: LS3Agent, buffer: TaggedReplayBuffer, config: DictConfig, run: RunFolder) -> None:
+        self.agent, self.buffer, self.config, self.run = agent, buffer, config, run
+        optim, loss = config.optim, config.loss
+        batch, interval, bootstrap = optim.batch_size, optim.target_interval, optim.bootstrap
+
+        def draw(tags: tuple, members: int | None = None) -> Callable[[], TensorDictBase]:
+            return lambda: buffer.sample(batch, tags=tags, members=members if bootstrap else None)
+
+        members, values = agent.dynamics.num_members, agent.value.num_members
+        goal = ClassifierLoss(agent.goal, name="goal")
+        goal.set_keys(label=("next", "success"))
+        td1: dict[str, Any] = {"gamma": loss.gamma, "zero_at_goal": loss.zero_at_goal, "bootstrap": bootstrap}
+        self.dynamics = Learner(
+            "dynamics",
+            EnsembleDynamicsLoss(agent.dynamics, bootstrap=bootstrap),
+            draw(ALL_TAGS, members),
+            lr=optim.dynamics_lr,
+        )
+        self.value = Learner(
+            "value", OfflineValueLoss(agent.value, bootstrap=bootstrap), draw(VALUE_TAGS, values), lr=optim.lr
+        )
+        self.value_td = Learner(
+            "value",
+            TD1ValueLoss(agent.value, **td1),
+            draw(VALUE_TAGS, values),
+            lr=optim.lr,
+            target_interval=interval,
+        )
+        self.safe_set = Learner(
+            "safe_set",
+            SafeSetLoss(agent.safe_set, gamma=loss.gamma_safe_set),
+            draw(ALL_TAGS),
+            lr=optim.lr,
+            target_interval=interval,
+        )
+        self.constraint = Learner("constraint", ClassifierLoss(agent.constraint), draw(ALL_TAGS), lr=optim.lr)
+        self.goal = Learner("goal", goal, draw(ALL_TAGS), lr=optim.lr)
+
+    def train_vae(self) -> None:
+        """Train encoder and decoder on all frames, freeze them, and encode every frame."""
+        options, agent = self.config.vae, self.agent
+        for half in (agent.encoder, agent.decoder):
+            half.to(memory_format=torch.channels_last)
+        loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta, reduction=options.reduction)
+        loss.set_keys(target="target_pixels")
+        optimizer = torch.optim.Adam(loss.parameters(), lr=options.lr, fused=True)
+        schedule = (
+            torch.optim.lr_scheduler.OneCycleLR(optimizer, options.lr, total_steps=options.steps, pct_start=0.1)
+            if options.schedule == "onecycle"
+            else torch.optim.lr_scheduler.ConstantLR(optimizer, factor=1.0)
+        )
+        device = next(agent.parameters()).device
+        with progress(options.steps, "VAE") as bar:
+            for i in range(options.steps):
+                target = self.buffer.sample_pixels(options.batch_size)["pixels"].to(device)
+                pixels = (
+                    target if options.crop_scale is None else random_resized_crop(target, scale=tuple(options.crop_scale))
+                )
+                batch = TensorDict({"pixels": pixels, "target_pixels": target}, [len(target)])
+                with torch.autocast(device.type, torch.bfloat16, enabled=options.autocast):
+                    losses = loss(batch)
+                optimizer.zero_grad()
+                losses["loss_vae"].backward()
+                optimizer.step()
+                schedule.step()
+                if i % LOG_EVERY == 0 or i == options.steps - 1:
+                    scalars = {key: item.item() for key, item in losses.items()}
+                    if not all(map(torch.isfinite, losses.values())):
+                        raise FloatingPointError(f"The VAE diverged: {scalars} at step {i}. Lower vae.lr.")
+                    bar.set_postfix_str(f"error {scalars['reconstruction']:.2e}", refresh=False)
+                    self.run.log("VAE", i, **scalars)
+                bar.update()
+        agent.encoder.requires_grad_(False)
+        agent.decoder.requires_grad_(False)
+        with progress(len(self.buffer.pixels), "Encoding", "frame") as bar:
+            self.buffer.encode(agent.encoder, progress=lambda done, _: bar.update(done - bar.n))
+
+    def train_offline(self) -> None:
+        """Train the latent models on the offline data (equations (2), (3), (4), (5) and the classifiers)."""
+        steps = self.config.offline
+        self.dynamics.train(steps.dynamics_steps, "Dynamics", self.run)
+        self.value.train(steps.value_steps, "Value, reward-to-go", self.run)
+        self.value_td.train(steps.value_td_steps, "Value, TD-1", self.run)
+        self._train_classifiers(steps.classifier_steps)
+
+    def train_online(self) -> None:
+        """One update on all data, after new episodes."""
+        steps = self.config.online
+        self.dynamics.train(steps.dynamics_steps, "Dynamics", self.run)
+        self.value_td.train(steps.value_td_steps, "Value, TD-1", self.run)
+        self._train_classifiers(steps.classifier_steps)
+
+    def _train_classifiers(self, steps: int) -> None:
+        self.safe_set.train(steps, "Safe set", self.run)
+        self.constraint.train(steps, "Constraint", self.run)
+        self.goal.train(steps, "Goal", self.run)
