@@ -87,7 +87,11 @@ class LS3Agent(nn.Module):
         propagation: Literal["ts1", "tsinf"] = "ts1",
     ) -> None:
         super().__init__()
-        for name, size in (("action_dim", action_dim), ("in_channels", in_channels), ("latent_dim", latent_dim)):
+        for name, size in (
+            ("action_dim", action_dim),
+            ("in_channels", in_channels),
+            ("latent_dim", latent_dim),
+        ):
             require_at_least(size, 1, name)
         self.architecture = AgentArchitecture(
             action_dim=action_dim,

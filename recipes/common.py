@@ -46,7 +46,10 @@ class RunFolder:
             )
         self.path.mkdir(parents=True)
         (self.path / "config.yaml").write_text(OmegaConf.to_yaml(config, resolve=True))
-        self.write_json("versions.json", {name: version(name) for name in PACKAGES} | {"python": platform.python_version()})
+        self.write_json(
+            "versions.json",
+            {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
+        )
         self._csv = (self.path / "metrics.csv").open("w", newline="")
         self._rows = csv.writer(self._csv)
         self._rows.writerow(["seconds", "phase", "step", "name", "value"])
@@ -147,7 +150,9 @@ def choose_device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(f"device={name} was asked for, but PyTorch sees no CUDA device. Use device=cpu or device=auto.")
+        raise ValueError(
+            f"device={name} was asked for, but PyTorch sees no CUDA device. Use device=cpu or device=auto."
+        )
     return torch.device(name)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import hydra
 import pictures
 import torch
@@ -71,7 +69,10 @@ def train(config: DictConfig) -> dict:
             offline = collect_demonstrations(config, seed["demonstrations"])
             save_episodes(offline, run.path / "demonstrations", task=config.task.name, seed=config.seed)
         buffer = TaggedReplayBuffer(
-            config.task.buffer_capacity, latent_dim=config.agent.latent_dim, gamma=config.loss.gamma, device=device
+            config.task.buffer_capacity,
+            latent_dim=config.agent.latent_dim,
+            gamma=config.loss.gamma,
+            device=device,
         )
         for tag, episodes in offline.items():
             buffer.add(episodes, tag)
@@ -90,7 +91,11 @@ def train(config: DictConfig) -> dict:
     ticking = planner.register_forward_hook(lambda *_: bar.update())
     if updates > 0:
         collector = Collector(
-            env, planner, frames_per_batch=worlds * horizon, total_frames=updates * worlds * horizon, device=device
+            env,
+            planner,
+            frames_per_batch=worlds * horizon,
+            total_frames=updates * worlds * horizon,
+            device=device,
         )
         rounds = iter(collector)
     for update in range(updates):
@@ -119,7 +124,7 @@ def train(config: DictConfig) -> dict:
 
     with timed(seconds, "evaluation"):
         evaluation = run_episodes(
-            config, agent, planner, config.evaluation.episodes, seed["evaluation"], device, what="Evaluation"
+            config, planner, config.evaluation.episodes, seed["evaluation"], device, what="Evaluation"
         )
     summary = {
         "task": config.task.name,

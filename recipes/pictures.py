@@ -1,1 +1,286 @@
-def draw_all(*a): pass
+"""Pictures of a run: curves, reconstructions, maps over the plane, plans, and a film of the agent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+
+import ls3_envs
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from common import read_metrics
+from matplotlib.axes import Axes
+from omegaconf import DictConfig
+from PIL import Image, ImageDraw
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from ls3_torchrl import LS3Agent
+from ls3_torchrl.data import Tag
+from ls3_torchrl.planners import LS3Planner
+
+INK, SAFE, UNSAFE, PALE = "#22303c", "#1b7f79", "#d1495b", "#b8c4cc"
+STYLE = {
+    "figure.dpi": 130,
+    "savefig.bbox": "tight",
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.edgecolor": PALE,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+}
+
+
+def draw_all(
+    folder: Path,
+    config: DictConfig,
+    agent: LS3Agent,
+    planner: LS3Planner,
+    offline: dict[Tag, TensorDictBase],
+    tracks: list[Tensor],
+    evaluation: TensorDictBase,
+) -> None:
+    """Every picture of a run, into its folder.
+
+    Args:
+        folder: the run's folder.
+        config: its configuration.
+        agent: the trained agent.
+        planner: its policy.
+        offline: the demonstrations by tag.
+        tracks: states ``[N, T, S]`` of the online episodes, one entry an update.
+        evaluation: the evaluation episodes ``[N, T]``.
+    """
+    with plt.rc_context(STYLE), torch.no_grad():
+        learning_curves(folder)
+        reconstructions(folder, agent, offline)
+        film(folder / "evaluation.gif", evaluation)
+        env = ls3_envs.make(config.task.name, num_worlds=1, seed=config.seed)
+        if env.plane() is not None:
+            maps(folder, env, agent, planner, offline)
+            paths(folder, env, offline, tracks, evaluation)
+            plans(folder, env, agent, planner, evaluation)
+
+
+def learning_curves(folder: Path) -> None:
+    """Return, success and violations over online episodes, and the losses of every phase."""
+    rows = read_metrics(folder)
+    series: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for row in rows:
+        series.setdefault((row["phase"], row["name"]), []).append((float(row["step"]), float(row["value"])))
+
+    figure, axes = plt.subplots(1, 3, figsize=(11, 2.8))
+    panels = (
+        ("mean_return", "Mean return"),
+        ("mean_success", "Success rate"),
+        ("mean_violation", "Violation rate"),
+    )
+    for axis, (name, title) in zip(axes, panels, strict=True):
+        points = series.get(("online", name), [])
+        axis.plot(*zip(*points, strict=True) if points else ([], []), marker="o", ms=3.5, lw=1.6, color=SAFE)
+        axis.set(title=title, xlabel="online episodes")
+        if name != "mean_return":
+            axis.set_ylim(-0.05, 1.05)
+        axis.grid(color=PALE, alpha=0.4, lw=0.6)
+    figure.savefig(folder / "learning_curves.png")
+    plt.close(figure)
+
+    losses = {key: points for key, points in series.items() if key[1].startswith("loss_")}
+    figure, axes = plt.subplots(2, 4, figsize=(12, 4.6), squeeze=False)
+    for axis in axes.flat[len(losses) :]:
+        axis.axis("off")
+    for axis, ((phase, _), points) in zip(axes.flat, losses.items(), strict=False):
+        x, y = np.array(points).T
+        axis.plot(x, y, lw=1.2, color=INK)
+        if (y > 0).all():
+            axis.set_yscale("log")
+        axis.set_title(phase)
+        axis.grid(color=PALE, alpha=0.4, lw=0.6)
+    figure.tight_layout()
+    figure.savefig(folder / "losses.png")
+    plt.close(figure)
+
+
+def reconstructions(folder: Path, agent: LS3Agent, offline: dict[Tag, TensorDictBase], columns: int = 12) -> None:
+    """Images above what the VAE makes of them, drawn from all data."""
+    frames = torch.cat([episodes["pixels"][:, ::7].flatten(0, 1) for episodes in offline.values()])
+    frames = frames[torch.linspace(0, len(frames) - 1, columns).long()]
+    td = agent.decoder(agent.encoder(TensorDict({"pixels": frames.to(_device(agent))}, [columns])))
+    made = (td["reco_pixels"].clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+    figure, axes = plt.subplots(2, columns, figsize=(columns, 2.2))
+    for column in range(columns):
+        for row, (images, name) in enumerate(((frames, "input"), (made, "VAE"))):
+            axes[row, column].imshow(images[column, :3].permute(1, 2, 0))
+            axes[row, column].set_axis_off()
+            if column == 0:
+                axes[row, 0].set_title(name, loc="left")
+    figure.subplots_adjust(wspace=0.05, hspace=0.25)
+    figure.savefig(folder / "reconstructions.png")
+    plt.close(figure)
+
+
+def _device(agent: LS3Agent) -> torch.device:
+    return next(agent.parameters()).device
+
+
+def _encode_states(env: ls3_envs.VisualConstraintEnv, agent: LS3Agent, states: Tensor) -> Tensor:
+    """Latents ``[n, D]`` of the images of states ``[n, S]``."""
+    parts = [
+        agent.encoder(TensorDict({"pixels": env.render_states(part).to(_device(agent))}, [len(part)]))["latent"]
+        for part in states.split(512)
+    ]
+    return torch.cat(parts)
+
+
+def _wall(axis: Axes, extent: tuple[float, float, float, float]) -> None:
+    """Wall, goal and frame of the navigation plane."""
+    low, high = ls3_envs.navigation.WALL_LOW, ls3_envs.navigation.WALL_HIGH
+    axis.add_patch(plt.Rectangle(low, high[0] - low[0], high[1] - low[1], fc="none", ec=INK, lw=1.2))
+    axis.add_patch(plt.Circle(ls3_envs.navigation.GOAL, ls3_envs.navigation.GOAL_RADIUS, fc="none", ec=INK, lw=1.2))
+    axis.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[], aspect="equal")
+
+
+def maps(
+    folder: Path,
+    env: ls3_envs.VisualConstraintEnv,
+    agent: LS3Agent,
+    planner: LS3Planner,
+    offline: dict[Tag, TensorDictBase],
+) -> None:
+    """Value, spread of the values, safe set, constraint and goal all over the plane, demonstrations drawn in."""
+    plane = env.plane()
+    assert plane is not None
+    grid, extent = plane
+    latent = _encode_states(env, agent, grid.reshape(-1, grid.shape[-1]))
+    td = agent.value(TensorDict({"latent": latent}, [len(latent)]))
+    values = td["state_value"].squeeze(-1)
+    panels = (
+        ("Value V", values.mean(-1), "viridis", None, None),
+        ("Spread of V over members", values.std(-1), "magma", None, None),
+        ("Safe set $f_S$", agent.safe_set.probability(latent), "BuGn", (0, 1), planner.safe_set_threshold),
+        (
+            "Constraint $f_C$",
+            agent.constraint.probability(latent),
+            "OrRd",
+            (0, 1),
+            planner.constraint_threshold,
+        ),
+        ("Goal $f_G$", agent.goal.probability(latent), "Blues", (0, 1), 0.5),
+    )
+    figure, axes = plt.subplots(1, len(panels), figsize=(16, 3.0))
+    for axis, (title, field, colours, limits, level) in zip(axes, panels, strict=True):
+        picture = field.reshape(grid.shape[:2]).cpu().numpy()
+        low, high = limits or (picture.min(), picture.max())
+        image = axis.imshow(picture, extent=extent, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+        if level is not None and picture.min() < level < picture.max():
+            axis.contour(grid[..., 0], grid[..., 1], picture, levels=[level], colors=INK, linewidths=0.8)
+        for tag, colour in ((Tag.SUCCESS, SAFE), (Tag.CONSTRAINT, UNSAFE)):
+            if tag in offline:
+                for track in offline[tag]["state"][:8]:
+                    axis.plot(track[:, 0], track[:, 1], color=colour, lw=0.5, alpha=0.6)
+        _wall(axis, extent)
+        axis.set_title(title)
+        figure.colorbar(image, ax=axis, shrink=0.7, pad=0.02)
+    figure.savefig(folder / "heatmaps.png")
+    plt.close(figure)
+
+
+def paths(
+    folder: Path,
+    env: ls3_envs.VisualConstraintEnv,
+    offline: dict[Tag, TensorDictBase],
+    tracks: list[Tensor],
+    evaluation: TensorDictBase,
+) -> None:
+    """Where the teacher went, where the agent went while it learnt, and where it goes now."""
+    plane = env.plane()
+    assert plane is not None
+    extent = plane[1]
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3.2))
+    titles = ("Demonstrations", "Online episodes, first to last", "Evaluation")
+    for axis, title in zip(axes, titles, strict=True):
+        _wall(axis, extent)
+        axis.set_title(title)
+    for track in offline[Tag.SUCCESS]["state"][:20]:
+        axes[0].plot(*track.T, color=SAFE, lw=0.6, alpha=0.6)
+    colours = plt.get_cmap("viridis")(np.linspace(0.9, 0.1, max(len(tracks), 1)))
+    for colour, update in zip(colours, tracks, strict=False):
+        for track in update:
+            axes[1].plot(*track.T, color=colour, lw=0.7, alpha=0.7)
+    violated = evaluation["next", "constraint"].any(1).flatten()
+    for track, bad in zip(evaluation["state"], violated, strict=True):
+        axes[2].plot(*track.T, color=UNSAFE if bad else SAFE, lw=0.8, alpha=0.7)
+    figure.savefig(folder / "paths.png")
+    plt.close(figure)
+
+
+def plans(
+    folder: Path,
+    env: ls3_envs.VisualConstraintEnv,
+    agent: LS3Agent,
+    planner: LS3Planner,
+    evaluation: TensorDictBase,
+    *,
+    moments: int = 4,
+    candidates: int = 150,
+) -> None:
+    """Random candidate plans at moments of one episode: feasible or not, and the plan that was chosen.
+
+    Positions are those that the true, noiseless world would reach under the planned actions.
+    """
+    plane = env.plane()
+    assert plane is not None
+    extent = plane[1]
+    episode = evaluation[0]
+    horizon, space = planner.horizon, planner.action_spec.space
+    figure, axes = plt.subplots(1, moments, figsize=(3.3 * moments, 3.0))
+    for axis, t in zip(axes, np.linspace(0, 0.45 * len(episode), moments).astype(int), strict=True):
+        state = episode["state"][t]
+        latent = _encode_states(env, agent, state[None])
+        draws = torch.rand(1, candidates, horizon, space.low.shape[-1], device=latent.device)
+        actions = space.low + (space.high - space.low) * draws
+        verdict = planner.judge(
+            planner.statistics(latent, actions),
+            torch.full((1, 1), planner.safe_set_threshold, device=latent.device),
+        )
+        chosen = planner.plan(latent).actions
+        for action, allowed in zip(actions[0].cpu(), verdict.feasible[0].cpu(), strict=True):
+            track = torch.cat([state[None], state + action.cumsum(0)])
+            axis.plot(*track.T, color=SAFE if allowed else UNSAFE, lw=0.5, alpha=0.45)
+        track = torch.cat([state[None], state + chosen[0].cpu().cumsum(0)])
+        axis.plot(*track.T, color=INK, lw=2.2)
+        _wall(axis, extent)
+        centre = state.tolist()
+        axis.set(xlim=(centre[0] - 35, centre[0] + 35), ylim=(centre[1] + 30, centre[1] - 30))
+        axis.set_title(f"step {t}: {verdict.feasible.float().mean():.0%} feasible")
+    figure.savefig(folder / "plans.png")
+    plt.close(figure)
+
+
+def film(path: Path, episodes: TensorDictBase, *, count: int = 6, zoom: int = 3, gap: int = 6) -> None:
+    """A GIF of some episodes side by side, each framed green in the goal and red once it violated."""
+    frames = []
+    shown = episodes[:count]
+    images = shown["next", "pixels"][:, :, -3:]
+    side = images.shape[-1] * zoom
+    for t in range(images.shape[1]):
+        sheet = Image.new("RGB", (count * (side + gap) + gap, side + 2 * gap), "white")
+        pen = ImageDraw.Draw(sheet)
+        for i in range(len(shown)):
+            x = gap + i * (side + gap)
+            bad, good = (bool(shown["next", key][i, t]) for key in ("constraint", "success"))
+            colour = UNSAFE if bad else SAFE if good else PALE
+            pen.rectangle((x - 3, gap - 3, x + side + 2, gap + side + 2), fill=colour)
+            picture = Image.fromarray(images[i, t].permute(1, 2, 0).numpy())
+            sheet.paste(picture.resize((side, side), Image.Resampling.NEAREST), (x, gap))
+        frames.append(sheet.quantize(32))
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=60, loop=0, optimize=True)

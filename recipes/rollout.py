@@ -9,7 +9,6 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import InitTracker, TransformedEnv
 
-from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag
 from ls3_torchrl.planners import LS3Planner
 
@@ -25,24 +24,17 @@ def collect_demonstrations(config: DictConfig, seed: int) -> dict[Tag, TensorDic
     """The task's offline data by tag; as many episodes as the paper, or ``task.offline_episodes`` of each."""
     kinds = ls3_envs.domain(config.task.name).offline
     datasets = {}
-    for i, kind in enumerate(progress_over(kinds, "Demonstrations")):
-        datasets[Tag.parse(kind)] = ls3_envs.collect_offline(
-            config.task.name, kind, episodes=config.task.get("offline_episodes"), seed=seed + i
-        )
-    return datasets
-
-
-def progress_over(items, what: str):  # noqa: ANN001, ANN201
-    """Iterate with a progress bar."""
-    with progress(len(items), what, "set") as bar:
-        for item in items:
-            yield item
+    with progress(len(kinds), "Demonstrations", "kind") as bar:
+        for i, kind in enumerate(kinds):
+            datasets[Tag.parse(kind)] = ls3_envs.collect_offline(
+                config.task.name, kind, episodes=config.task.get("offline_episodes"), seed=seed + i
+            )
             bar.update()
+    return datasets
 
 
 def run_episodes(
     config: DictConfig,
-    agent: LS3Agent,
     planner: LS3Planner,
     episodes: int,
     seed: int,

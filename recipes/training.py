@@ -50,9 +50,7 @@ class Learner:
         self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True)
         # HardUpdate copies at calls k + 1, 2(k + 1), …: one less than the interval that is meant.
         self.target = (
-            None
-            if target_interval is None
-            else HardUpdate(loss, value_network_update_interval=target_interval - 1)
+            None if target_interval is None else HardUpdate(loss, value_network_update_interval=target_interval - 1)
         )
         self.steps = 0
 
@@ -145,7 +143,9 @@ class Training:
             for i in range(options.steps):
                 target = self.buffer.sample_pixels(options.batch_size)["pixels"].to(device)
                 pixels = (
-                    target if options.crop_scale is None else random_resized_crop(target, scale=tuple(options.crop_scale))
+                    target
+                    if options.crop_scale is None
+                    else random_resized_crop(target, scale=tuple(options.crop_scale))
                 )
                 batch = TensorDict({"pixels": pixels, "target_pixels": target}, [len(target)])
                 with torch.autocast(device.type, torch.bfloat16, enabled=options.autocast):

@@ -119,6 +119,21 @@ class VisualConstraintEnv(EnvBase):
     def _succeeds(self, state: Tensor) -> Tensor:
         """Bool ``[N, 1]``: the state lies in the goal set."""
 
+    def render_states(self, state: Tensor) -> Tensor:
+        """Images uint8 ``[n, 3, image_size, image_size]`` of any states ``[n, state_dim]``, for pictures."""
+        return self._render(state.to(self.device))
+
+    def plane(self, points: int = 60) -> tuple[Tensor, tuple[float, float, float, float]] | None:
+        """A grid of states to draw maps over, where the domain is a plane; ``None`` where it is not.
+
+        Args:
+            points: grid points along the longer side.
+
+        Returns:
+            States ``[rows, columns, state_dim]`` and the picture's (left, right, bottom, top).
+        """
+        return None
+
     def _set_seed(self, seed: int | None) -> None:
         entropy = 0 if seed is None else int(seed)
         self._generators = [
@@ -128,9 +143,7 @@ class VisualConstraintEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = (
-            torch.arange(self.num_worlds)
-            if mask is None
-            else mask.reshape(self.num_worlds).nonzero().flatten().cpu()
+            torch.arange(self.num_worlds) if mask is None else mask.reshape(self.num_worlds).nonzero().flatten().cpu()
         )
         for world in rows.tolist():
             self._state[world] = self._initial_state(world, self._generators[world]).to(self.device)

@@ -84,6 +84,13 @@ class NavigationEnv(VisualConstraintEnv):
         self._pixel_x, self._pixel_y = centre * WINDOW[0], centre * WINDOW[1]
         self._background = self._draw_background()
 
+    def plane(self, points: int = 60) -> tuple[Tensor, tuple[float, float, float, float]]:
+        """Positions ``[rows, columns, 2]`` all over the window, y downwards, and its extent."""
+        rows = round(points * WINDOW[1] / WINDOW[0])
+        x = (torch.arange(points) + 0.5) * WINDOW[0] / points
+        y = (torch.arange(rows) + 0.5) * WINDOW[1] / rows
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1), (0.0, WINDOW[0], WINDOW[1], 0.0)
+
     def _initial_state(self, world: int, generator: np.random.Generator) -> Tensor:
         noise = generator.normal(scale=NOISE_STD, size=(self.horizon, 2))
         self._noise[world] = torch.as_tensor(noise, dtype=torch.float32)

@@ -84,12 +84,8 @@ class TaggedReplayBuffer:
                 return LazyTensorStorage(size, device=self.device)
             return LazyMemmapStorage(size, scratch_dir=str(folder / name))
 
-        self.pixels = TensorDictReplayBuffer(
-            storage=storage(self.pixel_capacity, "pixels"), sampler=RandomSampler()
-        )
-        self.latents = TensorDictReplayBuffer(
-            storage=storage(self.capacity, "latents"), sampler=RandomSampler()
-        )
+        self.pixels = TensorDictReplayBuffer(storage=storage(self.pixel_capacity, "pixels"), sampler=RandomSampler())
+        self.latents = TensorDictReplayBuffer(storage=storage(self.capacity, "latents"), sampler=RandomSampler())
         self._views: dict[tuple[Tag, ...], TensorDictReplayBuffer] = {}
         self._encoder: PixelEncoder | None = None
         self._frames_written = 0

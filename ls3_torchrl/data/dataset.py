@@ -62,6 +62,7 @@ def save_episodes(datasets: dict[Tag, TensorDictBase], folder: str | Path, *, ta
         raise FileExistsError(f"{folder} exists already. Choose another folder, or remove it first.")
     for tag, episodes in datasets.items():
         check_episodes(episodes, name=tag.name.lower())
+    for tag, episodes in datasets.items():
         episodes.contiguous().memmap(str(folder / tag.name.lower()))
     description = {
         "format": FORMAT,

@@ -21,6 +21,8 @@ def reward_to_go(reward: Tensor, gamma: float) -> Tensor:
         >>> reward_to_go(torch.tensor([[-1.0], [-1.0], [0.0]]), gamma=0.5).flatten().tolist()
         [-1.5, -1.0, 0.0]
     """
+    if gamma == 0.0:  # reward2go's filter would be empty
+        return reward.clone()
     end = torch.zeros_like(reward, dtype=torch.bool)
     end[..., -1, :] = True
     return reward2go(reward, end, gamma).reshape(reward.shape)

@@ -77,9 +77,7 @@ class SafeSet(LatentClassifier):
         logit_key: NestedKey = "safe_set_logit",
         prob_key: NestedKey | None = None,
     ) -> None:
-        super().__init__(
-            latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key
-        )
+        super().__init__(latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key)
 
 
 class ConstraintEstimator(LatentClassifier):
@@ -102,9 +100,7 @@ class ConstraintEstimator(LatentClassifier):
         logit_key: NestedKey = "constraint_logit",
         prob_key: NestedKey | None = None,
     ) -> None:
-        super().__init__(
-            latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key
-        )
+        super().__init__(latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key)
 
 
 class GoalEstimator(LatentClassifier):
@@ -127,6 +123,4 @@ class GoalEstimator(LatentClassifier):
         logit_key: NestedKey = "goal_logit",
         prob_key: NestedKey | None = None,
     ) -> None:
-        super().__init__(
-            latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key
-        )
+        super().__init__(latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key)

@@ -81,9 +81,7 @@ class EnsembleDynamics(TensorDictModuleBase):
         self.in_keys = [latent_key, action_key]
         self.out_keys = [next_latent_key]
         self.member_key, self.noise_key = member_key, noise_key
-        self.network = EnsembleMLP(
-            latent_dim + action_dim, 2 * latent_dim, num_members=num_members, hidden=hidden
-        )
+        self.network = EnsembleMLP(latent_dim + action_dim, 2 * latent_dim, num_members=num_members, hidden=hidden)
 
     def distribution(self, latent: Tensor, action: Tensor, *, per_member: bool = False) -> tuple[Tensor, Tensor]:
         """Every member's mean and standard deviation of the next latent.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -36,14 +37,19 @@ class EnsembleMLP(nn.Module):
     """
 
     def __init__(
-        self, in_features: int, out_features: int, *, num_members: int, hidden: Sequence[int] = (256, 256, 256)
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        num_members: int,
+        hidden: Sequence[int] = (256, 256, 256),
     ) -> None:
         super().__init__()
         self.num_members = require_at_least(num_members, 1, "num_members")
         sizes = [in_features, *hidden, out_features]
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+        for fan_in, fan_out in pairwise(sizes):
             bound = 1.0 / math.sqrt(fan_in)
             self.weights.append(torch.empty(num_members, fan_in, fan_out).uniform_(-bound, bound))
             self.biases.append(torch.empty(num_members, 1, fan_out).uniform_(-bound, bound))

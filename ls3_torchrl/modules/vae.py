@@ -19,6 +19,7 @@ from ls3_torchrl._checks import require_at_least, require_finite, require_keys
 
 IMAGE_SIZE = 64
 _FEATURES = 256
+_INITIAL_LOG_SCALE = -3.0
 
 
 def as_unit_pixels(pixels: Tensor, channels: int) -> Tensor:
@@ -65,6 +66,9 @@ class _ConvolutionalPosterior(nn.Module):
             nn.Flatten(),
         )
         self.head = nn.Linear(_FEATURES, 2 * latent_dim)
+        # A posterior that starts narrow: noise of scale 1 would drown the small means of an untrained encoder,
+        # and the decoder would dwell on the mean image.
+        nn.init.constant_(self.head.bias[latent_dim:], _INITIAL_LOG_SCALE)
         self.to_params = NormalParamExtractor(scale_mapping="exp", scale_lb=min_scale)
 
     def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:

@@ -60,6 +60,13 @@ class ClassifierLoss(LossModule):
         super().__init__()
         self.classifier = classifier
         self.name = name
+        self.out_keys = [f"loss_{name}", f"{name}_accuracy"]
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The keys that are read, as ``set_keys`` left them."""
+        keys = self.tensor_keys
+        return [keys.latent, keys.label]
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         pass
@@ -67,7 +74,7 @@ class ClassifierLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The loss on states ``[B]``."""
         keys = self.tensor_keys
-        require_keys(tensordict, (keys.latent, keys.label), "ClassifierLoss")
+        require_keys(tensordict, self.in_keys, "ClassifierLoss")
         label = tensordict.get(keys.label)
         logit = evaluate(self.classifier, tensordict.get(keys.latent))
         hits = ((logit.detach() > 0) == label.bool()).float()

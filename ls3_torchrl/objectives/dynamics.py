@@ -61,8 +61,15 @@ class EnsembleDynamicsLoss(LossModule):
 
     def __init__(self, dynamics: EnsembleDynamics, *, bootstrap: bool = False) -> None:
         super().__init__()
+        self.out_keys = ["loss_dynamics", "prediction_error"]
         self.dynamics = dynamics
         self.bootstrap = bootstrap
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The keys that are read, as ``set_keys`` left them."""
+        keys = self.tensor_keys
+        return [keys.latent, keys.action, keys.next_latent]
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         pass
@@ -70,7 +77,7 @@ class EnsembleDynamicsLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The loss on transitions ``[B]``, or ``[B, M]`` with ``bootstrap``."""
         keys = self.tensor_keys
-        require_keys(tensordict, (keys.latent, keys.action, keys.next_latent), "EnsembleDynamicsLoss")
+        require_keys(tensordict, self.in_keys, "EnsembleDynamicsLoss")
         latent, action = tensordict.get(keys.latent), tensordict.get(keys.action)
         target = tensordict.get(keys.next_latent)
         if self.bootstrap:

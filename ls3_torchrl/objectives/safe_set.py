@@ -70,7 +70,14 @@ class SafeSetLoss(LossModule):
     def __init__(self, safe_set: SafeSet, *, gamma: float = 0.3) -> None:
         super().__init__()
         self.convert_to_functional(safe_set, "safe_set", create_target_params=True)
+        self.out_keys = ["loss_safe_set"]
         self.gamma = check_discount(gamma, "gamma (of the safe set)")
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The keys that are read, as ``set_keys`` left them."""
+        keys = self.tensor_keys
+        return [keys.latent, keys.next_latent, keys.in_success]
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         pass
@@ -84,7 +91,7 @@ class SafeSetLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The loss on transitions ``[B]``."""
         keys = self.tensor_keys
-        require_keys(tensordict, (keys.latent, keys.next_latent, keys.in_success), "SafeSetLoss")
+        require_keys(tensordict, self.in_keys, "SafeSetLoss")
         target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.in_success))
         with self.safe_set_params.to_module(self.safe_set):
             logit = evaluate(self.safe_set, tensordict.get(keys.latent))

@@ -72,8 +72,15 @@ class VAELoss(LossModule):
         if beta < 0:
             raise ValueError(f"beta must not be negative, got {beta}.")
         self.encoder, self.decoder = encoder, decoder
+        self.out_keys = ["loss_vae", "reconstruction", "kl"]
         self.beta = beta
         self.reduction = require_choice(reduction, ("mean", "sum"), "reduction")
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The keys that are read, as ``set_keys`` left them."""
+        keys = self.tensor_keys
+        return [keys.pixels] if keys.target is None else [keys.pixels, keys.target]
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         pass
@@ -82,7 +89,7 @@ class VAELoss(LossModule):
         """The loss on images ``[B, C, 64, 64]``."""
         keys = self.tensor_keys
         target_key = keys.pixels if keys.target is None else keys.target
-        require_keys(tensordict, {keys.pixels, target_key}, "VAELoss")
+        require_keys(tensordict, self.in_keys, "VAELoss")
         pixels = tensordict.get(keys.pixels)
         target = as_unit_pixels(tensordict.get(target_key), pixels.shape[-3])
 

@@ -68,8 +68,15 @@ class OfflineValueLoss(LossModule):
 
     def __init__(self, value: ValueEnsemble, *, bootstrap: bool = False) -> None:
         super().__init__()
+        self.out_keys = ["loss_value"]
         self.value = value
         self.bootstrap = bootstrap
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The keys that are read, as ``set_keys`` left them."""
+        keys = self.tensor_keys
+        return [keys.latent, keys.reward_to_go]
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         pass
@@ -77,7 +84,7 @@ class OfflineValueLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The loss on states ``[B]``, or ``[B, M]`` with ``bootstrap``."""
         keys = self.tensor_keys
-        require_keys(tensordict, (keys.latent, keys.reward_to_go), "OfflineValueLoss")
+        require_keys(tensordict, self.in_keys, "OfflineValueLoss")
         latent, target = tensordict.get(keys.latent), tensordict.get(keys.reward_to_go)
         if self.bootstrap:
             check_members(latent, self.value.num_members, "OfflineValueLoss")
@@ -151,10 +158,17 @@ class TD1ValueLoss(LossModule):
     ) -> None:
         super().__init__()
         self.convert_to_functional(value, "value", create_target_params=True)
+        self.out_keys = ["loss_value"]
         self.num_members = value.num_members
         self.gamma = check_discount(gamma)
         self.zero_at_goal = zero_at_goal
         self.bootstrap = bootstrap
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The keys that are read, as ``set_keys`` left them."""
+        keys = self.tensor_keys
+        return [keys.latent, keys.next_latent, keys.reward]
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         pass
@@ -172,7 +186,7 @@ class TD1ValueLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The loss on transitions ``[B]``, or ``[B, M]`` with ``bootstrap``."""
         keys = self.tensor_keys
-        require_keys(tensordict, (keys.latent, keys.next_latent, keys.reward), "TD1ValueLoss")
+        require_keys(tensordict, self.in_keys, "TD1ValueLoss")
         latent = tensordict.get(keys.latent)
         if self.bootstrap:
             check_members(latent, self.num_members, "TD1ValueLoss")

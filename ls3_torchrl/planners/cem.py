@@ -103,9 +103,7 @@ class CrossEntropyMethod:
     ) -> None:
         self.num_candidates = require_at_least(num_candidates, 1, "num_candidates")
         if not 1 <= num_elites <= num_candidates:
-            raise ValueError(
-                f"num_elites must lie between 1 and num_candidates = {num_candidates}, got {num_elites}."
-            )
+            raise ValueError(f"num_elites must lie between 1 and num_candidates = {num_candidates}, got {num_elites}.")
         if not 0.0 <= p_random <= 1.0:
             raise ValueError(f"p_random must lie in [0, 1], got {p_random}.")
         if min_std < 0.0:
@@ -170,9 +168,7 @@ class CrossEntropyMethod:
         rows = torch.arange(batch, device=device)
         population = 0
         while rows.numel():
-            normal, uniform = (
-                self.draw(rows, horizon, shape[-1]) if noise is None else noise(rows, population)
-            )
+            normal, uniform = self.draw(rows, horizon, shape[-1]) if noise is None else noise(rows, population)
             actions = mean[rows, None] + std[rows, None] * normal
             is_uniform = (step[rows] == 0)[:, None] & uniform_first
             actions = torch.where(is_uniform[..., None, None], low + side * uniform, actions)
@@ -180,7 +176,7 @@ class CrossEntropyMethod:
 
             score, allowed, fallback = evaluate(actions, rows, restarts[rows], population)
             populations[rows] += 1
-            allowed = allowed & ~score.isnan()
+            allowed = allowed & (score > -torch.inf)  # False for NaN too
             score = score.masked_fill(~allowed, -torch.inf)
             elite_score, elite = score.topk(self.num_elites, dim=-1)
             any_allowed = allowed.any(-1)

@@ -42,11 +42,15 @@ def _layers_of(network: nn.Module, dtype: torch.dtype) -> Layers:
 def _members_of(network: EnsembleMLP, dtype: torch.dtype) -> list[Layers]:
     return [
         [
-            (weight[m].detach().T.to(dtype).contiguous(), bias[m, 0].detach().to(dtype).clone())
+            (weight[m].detach().T.to(dtype, copy=True).contiguous(), bias[m, 0].detach().to(dtype).clone())
             for weight, bias in zip(network.weights, network.biases, strict=True)
         ]
         for m in range(network.num_members)
     ]
+
+
+def _same(one: Tensor, other: Tensor) -> bool:
+    return (one.device, one.dtype) == (other.device, other.dtype) and torch.equal(one, other)
 
 
 @lru_cache(maxsize=1)
@@ -106,7 +110,7 @@ class FusedImagination:
         safe_set: f_S.
         constraint_reduction: over particles, ``"max"`` or ``"mean"``.
         precision: ``"fp32"``, ``"bf16"``, or ``"auto"`` for what a short measurement finds faster here.
-        block: candidates carried together.
+        block: particles of candidates that are carried and judged together.
 
     Raises:
         ValueError: for an unknown precision.
@@ -133,7 +137,7 @@ class FusedImagination:
         self.constraint_reduction = constraint_reduction
         self.precision = precision
         self.block = block
-        self._stamp: tuple[tuple[int, int], ...] = ()
+        self._seen: list[Tensor] = []
         self._dynamics: list[Layers] = []
         self._value: list[Layers] = []
         self._heads: dict[str, Layers] = {}
@@ -151,10 +155,11 @@ class FusedImagination:
 
     def refresh(self) -> bool:
         """Take the snapshot anew if a parameter changed; return whether it had."""
-        stamp = tuple((p.data_ptr(), p._version) for p in self._parameters())
-        if stamp == self._stamp:
+        # Values are compared: fused optimisers change parameters without raising their version counter.
+        parameters = list(self._parameters())
+        if len(parameters) == len(self._seen) and all(map(_same, parameters, self._seen)):
             return False
-        device = next(iter(self._parameters())).device
+        device = parameters[0].device
         chosen = fastest_precision(device.type) if self.precision == "auto" else self.precision
         self._dtype = torch.bfloat16 if chosen == "bf16" else torch.float32
         self._dynamics = _members_of(self.env.dynamics.network, self._dtype)
@@ -167,7 +172,7 @@ class FusedImagination:
                 ("safe_set", self.safe_set),
             )
         }
-        self._stamp = stamp
+        self._seen = [p.detach().clone() for p in parameters]
         return True
 
     @torch.no_grad()
@@ -185,33 +190,38 @@ class FusedImagination:
             for start in range(0, n, self.block):
                 part = slice(start, min(start + self.block, n))
                 plan = actions[row, part].transpose(0, 1).contiguous()  # [H, R, A]
-                for p in range(particles):
-                    path = self._carry(
-                        latent[row],
-                        plan,
-                        [members[t][p] for t in range(horizon)],
-                        [noise.noise[row, t, p, part if noise.noise.shape[3] > 1 else slice(None)] for t in range(horizon)],
-                    )
-                    states = torch.stack(path)  # [H, R, D]
-                    flat = states.reshape(-1, states.shape[-1])
-                    in_goal = run_layers(flat, self._heads["goal"]).float().sigmoid()
-                    violating = run_layers(flat, self._heads["constraint"]).float().sigmoid()
-                    goal[row, part] += in_goal.reshape(horizon, -1).T
+                shared = noise.noise.shape[3] == 1
+                step_noise = noise.noise[row] if shared else noise.noise[row, :, :, part]
+                group = max(1, self.block // plan.shape[1])
+                for first in range(0, particles, group):
+                    chosen = range(first, min(first + group, particles))
+                    states = torch.stack(
+                        [self._carry(latent[row], plan, [m[p] for m in members], step_noise[:, p]) for p in chosen]
+                    )  # [G, H, R, D]
+                    in_goal = self._probability("goal", states)
+                    violating = self._probability("constraint", states)
+                    goal[row, part] += in_goal.sum(0).T
                     if self.constraint_reduction == "max":
-                        violating = violating.reshape(horizon, -1).T
-                        constraint[row, part] = torch.maximum(constraint[row, part], violating)
+                        worst = torch.maximum(constraint[row, part], violating.amax(0).T)
+                        constraint[row, part] = worst
                     else:
-                        constraint[row, part] += violating.reshape(horizon, -1).T
-                    end = states[-1]
-                    safe[row, part] += run_layers(end, self._heads["safe_set"]).float().sigmoid().squeeze(-1)
+                        constraint[row, part] += violating.sum(0).T
+                    end = states[:, -1]
+                    safe[row, part] += self._probability("safe_set", end).sum(0)
+                    flat = end.reshape(-1, end.shape[-1])
                     for m, layers in enumerate(self._value):
-                        value[row, part, m] += run_layers(end, layers).float().squeeze(-1)
+                        value[row, part, m] += run_layers(flat, layers).float().reshape(len(chosen), -1).sum(0)
         if self.constraint_reduction == "mean":
             constraint /= particles
         return PlanStatistics(value / particles, goal / particles, constraint, safe / particles)
 
-    def _carry(self, latent: Tensor, plan: Tensor, members: list[int], noise: list[Tensor]) -> list[Tensor]:
-        """One particle of every plan ``[H, R, A]``: the latents ``[R, D]`` that it visits, in layer precision."""
+    def _probability(self, head: str, states: Tensor) -> Tensor:
+        """Probabilities ``[...]`` by a head of latents ``[..., D]``."""
+        logit = run_layers(states.reshape(-1, states.shape[-1]), self._heads[head])
+        return logit.float().sigmoid().reshape(states.shape[:-1])
+
+    def _carry(self, latent: Tensor, plan: Tensor, members: list[int], noise: Tensor) -> Tensor:
+        """One particle of every plan ``[H, R, A]``: the latents ``[H, R, D]`` it visits, in layer precision."""
         low, high = self.env.dynamics.log_scale_bounds
         state = latent.expand(plan.shape[1], -1)
         path = []
@@ -220,4 +230,4 @@ class FusedImagination:
             delta, log_scale = run_layers(inputs, self._dynamics[member]).float().chunk(2, -1)
             state = torch.addcmul(state + delta, log_scale.clamp(low, high).exp(), step_noise.expand_as(delta))
             path.append(state.to(self._dtype))
-        return path
+        return torch.stack(path)

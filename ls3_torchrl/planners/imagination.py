@@ -94,7 +94,11 @@ class RolloutImagination:
         if dynamics.propagation == "tsinf":
             first.set(dynamics.member_key, noise.members[0].reshape(1, 1, p, 1).expand(b, n, p, 1))
         path = self.env.rollout(
-            horizon, follow_the_plan, auto_reset=False, tensordict=self.env.reset(first), return_contiguous=True
+            horizon,
+            follow_the_plan,
+            auto_reset=False,
+            tensordict=self.env.reset(first),
+            return_contiguous=True,
         )
         end = path["next", "latent"][..., -1, :]
         ends = TensorDict({self.value.in_keys[0]: end}, [b, n, p])

@@ -63,7 +63,9 @@ class LatentEnv(ModelBasedEnvBase):
         ]
         reward = TensorDictModule(_reward_of_goal, ["goal_prob"], ["reward"])
         super().__init__(
-            TensorDictSequential(*dynamics_step, *judges, reward), device=torch.device(device), batch_size=None
+            TensorDictSequential(*dynamics_step, *judges, reward),
+            device=torch.device(device),
+            batch_size=None,
         )
         # TensorDictModule does not register bound methods' owners: hold the networks here.
         self.dynamics, self.constraint, self.goal = (m.to(self.device) for m in (dynamics, constraint, goal))

@@ -202,8 +202,7 @@ class LS3Planner(MPCPlannerBase):
         """All noise that a plan for ``batch`` rows can need; large, meant for tests and comparisons."""
         device, rows = self.action_spec.device, torch.arange(batch, device=self.action_spec.device)
         draws = [
-            (*self._draw_candidates(rows, k), *self._draw_imagination(rows, k))
-            for k in range(self.cem.max_populations)
+            (*self._draw_candidates(rows, k), *self._draw_imagination(rows, k)) for k in range(self.cem.max_populations)
         ]
         return PlanNoise(*(torch.stack(parts).to(device) for parts in zip(*draws, strict=True)))
 
@@ -215,9 +214,7 @@ class LS3Planner(MPCPlannerBase):
         fixed = dynamics.propagation == "tsinf"
         candidates = 1 if self.common_noise else self.cem.num_candidates
         shape = (rows.numel(), self.horizon, self.num_particles, candidates, dynamics.latent_dim)
-        members = draw_members(
-            dynamics.num_members, self.horizon, self.num_particles, fixed=fixed, device=rows.device
-        )
+        members = draw_members(dynamics.num_members, self.horizon, self.num_particles, fixed=fixed, device=rows.device)
         return ImaginationNoise(members, torch.randn(shape, device=rows.device))
 
     def encode(self, tensordict: TensorDictBase) -> Tensor:
@@ -237,9 +234,7 @@ class LS3Planner(MPCPlannerBase):
         """Objective, feasibility and fallback ranking of candidates under δ_S ``[b, 1]``."""
         return Judgement(
             objective(statistics, pessimism=self.pessimism),
-            feasible(
-                statistics, safe_set_threshold=threshold, constraint_threshold=self.constraint_threshold
-            ),
+            feasible(statistics, safe_set_threshold=threshold, constraint_threshold=self.constraint_threshold),
             least_harm(statistics, constraint_threshold=self.constraint_threshold),
         )
 

@@ -1,0 +1,33 @@
+"""Collect a task's offline episodes and save them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+from common import console, episode_figures, summarise
+from omegaconf import DictConfig
+from rollout import collect_demonstrations
+
+from ls3_torchrl.data import save_episodes
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="collect")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    folder = Path(config.output)
+    if folder.exists():
+        raise FileExistsError(f"The output folder {folder} exists already. Choose another with output=DIR.")
+    datasets = collect_demonstrations(config, config.seed)
+    save_episodes(datasets, folder, task=config.task.name, seed=config.seed)
+    for tag, episodes in datasets.items():
+        s = summarise([episode_figures(episodes)])
+        console.print(
+            f"{tag.name.lower():<12} {s['episodes']} episodes, success {s['success_rate']:.0%}, "
+            f"violation {s['violation_rate']:.0%}, return {s['return_mean']:.1f} ± {s['return_std']:.1f}"
+        )
+    console.print(f"Saved in [bold]{folder}[/bold]; train on them with data={folder}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""Evaluate a trained agent of a run folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+import pictures
+import torch
+from common import RunFolder, choose_device, episode_figures, hardware, print_summary, summarise
+from omegaconf import DictConfig, OmegaConf
+from rollout import make_env, run_episodes
+
+from ls3_torchrl import LS3Agent
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    folder = Path(config.run)
+    if not (folder / "config.yaml").is_file():
+        raise FileNotFoundError(f"{folder} is no run folder: config.yaml is missing. Pass run=DIR of a finished run.")
+    device = choose_device(config.device)
+    trained = OmegaConf.load(folder / "config.yaml")
+    assert isinstance(trained, DictConfig)
+    planner_options = OmegaConf.merge(trained.planner, config.planner)
+    torch.manual_seed(config.seed)
+    action_spec = make_env(trained, 1, config.seed, device).action_spec
+    agent = LS3Agent.load(folder / config.agent, device=device, action_dim=action_spec.shape[-1])
+    planner = agent.planner(action_spec, **planner_options)
+    run = RunFolder(config.output, OmegaConf.merge(config, {"planner": planner_options}))
+    episodes = run_episodes(trained, planner, config.episodes, config.seed, device, what="Evaluation")
+    summary = {
+        "task": trained.task.name,
+        "preset": trained.preset,
+        "seed": config.seed,
+        "evaluation": summarise([episode_figures(episodes)]),
+        "hardware": hardware(device),
+        "agent": str(folder / config.agent),
+    }
+    pictures.film(run.path / "evaluation.gif", episodes)
+    summary["minutes"] = round(run.seconds / 60, 2)
+    run.write_json("summary.json", summary)
+    run.close()
+    print_summary(summary, run.path)
+
+
+if __name__ == "__main__":
+    main()

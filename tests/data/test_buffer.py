@@ -1,0 +1,295 @@
+import pytest
+import torch
+from tensordict import TensorDict
+
+from ls3_torchrl.data import Tag, TaggedReplayBuffer
+from ls3_torchrl.modules import PixelEncoder
+
+D = 4
+SCALE = 0.5
+
+
+def reading_encoder(factor=1.0):
+    """An encoder whose loc[0] is ``factor`` times an image's grey value in 0…255, and scale is SCALE."""
+    encoder = PixelEncoder(latent_dim=D)
+    with torch.no_grad():
+        for name, parameter in encoder.named_parameters():
+            parameter.zero_()
+            if "convolutions" in name and name.endswith("weight"):  # each layer averages what it sees
+                parameter.fill_(1 / parameter[0].numel())
+            elif "head.weight" in name:
+                parameter[0].fill_(255.0 * factor / parameter.shape[1])
+            elif "head.bias" in name:
+                parameter[D:].fill_(float(torch.tensor(SCALE).log()))
+    return encoder
+
+
+class Film:
+    """Makes episodes of frames numbered on and on: frame k is an image of grey value k, its action is (k, −k)."""
+
+    def __init__(self):
+        self.frame = 0
+
+    def shoot(self, steps, success=()):
+        number = torch.arange(self.frame, self.frame + steps + 1)
+        self.frame += steps + 1
+        images = number.to(torch.uint8).reshape(-1, 1, 1, 1).expand(-1, 3, 64, 64).contiguous()
+        done = torch.zeros(steps, 1, dtype=torch.bool)
+        done[list(success)] = True
+        return TensorDict(
+            {
+                "pixels": images[:-1],
+                "action": torch.stack([number[:-1], -number[:-1]], -1).float(),
+                "next": {
+                    "pixels": images[1:],
+                    "reward": done.float() - 1,
+                    "constraint": number[:-1, None] % 3 == 0,
+                    "success": done,
+                },
+            },
+            [steps],
+        )
+
+
+def assert_rows_show_their_frames(buffer, numbers, factor=1.0):
+    """Exactly the transitions of the frames ``numbers`` are stored, each with the posteriors of its two images."""
+    rows = buffer.latents.storage[:]
+    number = rows["action"][:, 0]
+    assert sorted(number.int().tolist()) == sorted(numbers)
+    torch.testing.assert_close(rows["loc"][:, 0], factor * number, atol=1e-2, rtol=0)
+    torch.testing.assert_close(rows["next", "loc"][:, 0], factor * (number + 1), atol=1e-2, rtol=0)
+    for scale in (rows["scale"], rows["next", "scale"]):
+        torch.testing.assert_close(scale, torch.full_like(scale, SCALE), atol=1e-3, rtol=0)
+
+
+@pytest.fixture(params=["memory", "memmap"])
+def scratch(request, tmp_path):
+    return None if request.param == "memory" else tmp_path / "scratch"
+
+
+def test_labels_and_tags_are_right_by_hand(scratch):
+    film = Film()
+    buffer = TaggedReplayBuffer(20, latent_dim=D, gamma=0.5, scratch_dir=scratch)
+    buffer.add(film.shoot(3, success=[1]), "success")
+    buffer.add(film.shoot(2), Tag.CONSTRAINT)
+    rows = buffer.latents.storage[:]
+    assert len(buffer) == 5
+    assert rows["tag"].flatten().tolist() == [0, 0, 0, 2, 2]
+    assert rows["in_success"].flatten().tolist() == [True, True, False, False, False]
+    assert rows["reward_to_go"].flatten().tolist() == [-1.25, -0.5, -1.0, -1.5, -1.0]
+    assert rows["next", "success"].flatten().tolist() == [False, True, False, False, False]
+    assert rows["next", "reward"].flatten().tolist() == [-1.0, 0.0, -1.0, -1.0, -1.0]
+    assert rows["next", "constraint"].flatten().tolist() == [True, False, False, False, False]
+    assert [buffer.count([tag]) for tag in Tag] == [3, 0, 2, 0]
+    assert buffer.count() == 5
+    assert scratch is None or any((scratch / "pixels").iterdir())
+
+
+def test_frames_match_rows_when_encoded_at_the_end(scratch):
+    film = Film()
+    buffer = TaggedReplayBuffer(20, latent_dim=D, scratch_dir=scratch)
+    buffer.add(film.shoot(3), "success")
+    buffer.add(film.shoot(4), "rand")
+    buffer.encode(reading_encoder())
+    # Frames 3 and 8 end their episodes: they start no transition.
+    assert_rows_show_their_frames(buffer, [0, 1, 2, 4, 5, 6, 7])
+
+
+def test_frames_match_rows_of_episodes_added_after_encoding(scratch):
+    film = Film()
+    buffer = TaggedReplayBuffer(20, latent_dim=D, scratch_dir=scratch)
+    buffer.encode(reading_encoder())  # nothing there yet
+    buffer.add(film.shoot(3), "success")
+    assert_rows_show_their_frames(buffer, [0, 1, 2])
+
+
+def test_both_rings_wrap_round_and_keep_images_labels_and_tags_together(scratch):
+    film = Film()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, gamma=0.5, pixel_capacity=14, scratch_dir=scratch)
+    buffer.add(film.shoot(4), "success")  # frames 0 to 4
+    buffer.add(film.shoot(4, success=[3]), "rand")  # 5 to 9
+    buffer.encode(reading_encoder())
+    buffer.add(film.shoot(4, success=[0]), "online")  # 10 to 14: both stores write over their oldest
+    left = [2, 3, 5, 6, 7, 8, 10, 11, 12, 13]
+    assert len(buffer) == 10
+    assert len(buffer.pixels) == 14
+    assert_rows_show_their_frames(buffer, left)
+    # A better encoder later must find each row's images again, in the ring as it lies now.
+    buffer.encode(reading_encoder(factor=2.0))
+    assert_rows_show_their_frames(buffer, left, factor=2.0)
+    rows = buffer.latents.storage[:]
+    by_frame = dict(zip(rows["action"][:, 0].int().tolist(), range(10), strict=True))
+    order = [by_frame[number] for number in left]
+    assert rows["tag"].flatten()[order].tolist() == [0, 0, 1, 1, 1, 1, 3, 3, 3, 3]
+    assert rows["in_success"].flatten()[order].tolist() == [False] * 2 + [True] * 5 + [False] * 3
+    expected = [-1.5, -1.0, -1.75, -1.5, -1.0, 0.0, -0.875, -1.75, -1.5, -1.0]
+    assert rows["reward_to_go"].flatten()[order].tolist() == expected
+    assert [buffer.count([tag]) for tag in Tag] == [2, 4, 0, 4]
+    shown = buffer.pixels.storage[:]["pixels"][:, 0, 0, 0]
+    assert sorted(shown.tolist()) == list(range(1, 15))
+
+
+def test_many_rounds_of_the_ring_stay_consistent():
+    film = Film()
+    buffer = TaggedReplayBuffer(9, latent_dim=D, pixel_capacity=13)
+    for i, steps in enumerate([5, 3, 7, 2, 6, 4, 8, 5]):
+        buffer.add(film.shoot(steps), "online")
+        if i == 3:
+            buffer.encode(reading_encoder())
+    # The last nine transitions: the last five of the film, and four of the eight before.
+    last = film.frame - 6
+    assert_rows_show_their_frames(buffer, [*range(last - 5, last - 1), *range(last, last + 5)])
+
+
+def test_a_batch_of_episodes_is_stored_one_after_another():
+    film = Film()
+    buffer = TaggedReplayBuffer(20, latent_dim=D, gamma=0.5)
+    buffer.add(torch.stack([film.shoot(3), film.shoot(3, success=[2])]), "success")
+    buffer.encode(reading_encoder())
+    assert_rows_show_their_frames(buffer, [0, 1, 2, 4, 5, 6])
+    # Labels stop at the episode's end: the second episode's success is not the first one's.
+    assert buffer.latents.storage[:]["in_success"].flatten().tolist() == [False] * 3 + [True] * 3
+
+
+def test_overwritten_frames_are_refused_at_encoding_not_mixed_up():
+    film = Film()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, pixel_capacity=10)
+    for _ in range(3):
+        buffer.add(film.shoot(4), "success")
+    with pytest.raises(RuntimeError, match=r"older than number 5 were overwritten.*need frame 2.*pixel_capacity"):
+        buffer.encode(reading_encoder())
+
+
+def test_latents_are_drawn_anew_from_the_posterior_at_each_use():
+    torch.manual_seed(0)
+    film = Film()
+    buffer = TaggedReplayBuffer(20, latent_dim=D)
+    buffer.add(film.shoot(1), "success")  # one row: every draw is of frames 0 and 1
+    buffer.encode(reading_encoder())
+    batch = buffer.sample(4000)
+    for group in (batch, batch["next"]):
+        noise = (group["latent"] - group["loc"]) / SCALE
+        # 16,000 standard normals: mean 0 ± 0.008, deviation 1 ± 0.006.
+        assert noise.mean().abs() < 0.04
+        assert (noise.std() - 1).abs() < 0.03
+    here, there = ((group["latent"] - group["loc"]).flatten() for group in (batch, batch["next"]))
+    assert torch.corrcoef(torch.stack([here, there]))[0, 1].abs() < 0.04
+    assert "latent" not in buffer.latents.storage[:].keys()  # drawn, never stored
+
+
+def test_members_get_batches_of_their_own():
+    torch.manual_seed(0)
+    film = Film()
+    buffer = TaggedReplayBuffer(20, latent_dim=D)
+    buffer.add(film.shoot(8), "success")
+    buffer.encode(reading_encoder())
+    batch = buffer.sample(6400, members=2)
+    assert batch.batch_size == (6400, 2)
+    assert batch["latent"].shape == (6400, 2, D)
+    assert batch["next", "latent"].shape == (6400, 2, D)
+    assert batch["tag"].shape == (6400, 2, 1)
+    # Independence: each of the 8 × 8 pairs of rows is due 100 of the draws, give or take 10.
+    pair = batch["action"][:, 0, 0].long() * 8 + batch["action"][:, 1, 0].long()
+    assert (torch.bincount(pair, minlength=64) - 100).abs().max() < 50
+    # Rows and latents still belong together.
+    assert (batch["latent"][..., 0] - batch["action"][..., 0]).abs().max() < 7 * SCALE
+
+
+def test_sample_honours_tags_added_before_and_after_a_view_was_made():
+    film = Film()
+    buffer = TaggedReplayBuffer(40, latent_dim=D)
+    buffer.encode(reading_encoder())
+    buffer.add(film.shoot(2), "success")
+    assert set(buffer.sample(64, tags=["success"])["tag"].flatten().tolist()) == {0}
+    buffer.add(film.shoot(2), "online")
+    buffer.add(film.shoot(2), "success")
+    frames = buffer.sample(500, tags=["success"])["action"][:, 0]
+    assert set(frames.int().tolist()) == {0, 1, 6, 7}
+    assert set(buffer.sample(500)["tag"].flatten().tolist()) == {0, 3}
+
+
+def test_sample_without_rows_of_the_tag_names_it():
+    buffer = TaggedReplayBuffer(20, latent_dim=D)
+    buffer.add(Film().shoot(2), "success")
+    buffer.encode(reading_encoder())
+    with pytest.raises(RuntimeError, match="no data tagged 'constraint'"):
+        buffer.sample(4, tags=["constraint"])
+
+
+def test_sample_before_encoding_says_what_to_do():
+    buffer = TaggedReplayBuffer(20, latent_dim=D)
+    buffer.add(Film().shoot(2), "success")
+    with pytest.raises(RuntimeError, match=r"call buffer\.encode"):
+        buffer.sample(4)
+
+
+def test_pixels_are_sampled_uniformly_from_all_frames_last_ones_included(scratch):
+    torch.manual_seed(0)
+    buffer = TaggedReplayBuffer(20, latent_dim=D, scratch_dir=scratch)
+    with pytest.raises(RuntimeError, match="no images yet"):
+        buffer.sample_pixels(4)
+    buffer.add(Film().shoot(3), "success")
+    pixels = buffer.sample_pixels(400)["pixels"]
+    assert pixels.dtype == torch.uint8
+    assert pixels.shape == (400, 3, 64, 64)
+    assert (torch.bincount(pixels[:, 0, 0, 0].long(), minlength=4) - 100).abs().max() < 45
+
+
+@pytest.mark.parametrize(("key", "what"), [("action", "action"), (("next", "reward"), "reward")])
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_numbers_that_are_not_finite_never_get_in(key, what, bad):
+    episode = Film().shoot(3)
+    episode[key][1, 0] = bad
+    buffer = TaggedReplayBuffer(20, latent_dim=D)
+    with pytest.raises(ValueError, match=f"episode's {what} is not finite: 1 of"):
+        buffer.add(episode, "success")
+    assert len(buffer) == len(buffer.pixels) == 0
+
+
+def test_missing_keys_wrong_shapes_and_unknown_tags_are_refused():
+    episode = Film().shoot(3)
+    buffer = TaggedReplayBuffer(20, latent_dim=D)
+    with pytest.raises(KeyError, match="constraint"):
+        buffer.add(episode.exclude(("next", "constraint")), "success")
+    with pytest.raises(ValueError, match=r"\[T\] or \[N, T\], got \[1, 1, 3\]"):
+        buffer.add(episode[None, None], "success")
+    with pytest.raises(ValueError, match="Unknown tag"):
+        buffer.add(episode, "demos")
+    assert len(buffer) == 0
+
+
+@pytest.mark.parametrize("sizes", [{"capacity": 3}, {"capacity": 20, "pixel_capacity": 4}])
+def test_an_episode_longer_than_the_buffer_is_refused(sizes):
+    with pytest.raises(ValueError, match="4 steps does not fit"):
+        TaggedReplayBuffer(latent_dim=D, **sizes).add(Film().shoot(4), "success")
+
+
+@pytest.mark.parametrize("sizes", [{"capacity": 0}, {"capacity": 5, "pixel_capacity": 1}, {"capacity": 5, "latent_dim": 0}])
+def test_impossible_sizes_are_refused(sizes):
+    with pytest.raises(ValueError, match="must be at least"):
+        TaggedReplayBuffer(**sizes)
+
+
+def test_an_encoder_of_another_size_is_refused():
+    buffer = TaggedReplayBuffer(20, latent_dim=D)
+    buffer.add(Film().shoot(2), "success")
+    with pytest.raises(ValueError, match="latents of size 6.*latent_dim=4"):
+        buffer.encode(PixelEncoder(latent_dim=6))
+
+
+def test_the_default_pixel_store_keeps_all_frames_of_the_stored_rows():
+    # Short episodes have many frames that start no transition; 16 steps are what the default allows for.
+    film = Film()
+    buffer = TaggedReplayBuffer(96, latent_dim=D)
+    for _ in range(8):
+        buffer.add(film.shoot(16), "online")
+    buffer.encode(reading_encoder())
+    assert_rows_show_their_frames(buffer, [i for i in range(34, 136) if i % 17 != 16])
+
+
+def test_encoding_reports_its_progress():
+    buffer = TaggedReplayBuffer(20, latent_dim=D)
+    buffer.add(Film().shoot(5), "success")
+    calls = []
+    buffer.encode(reading_encoder(), progress=lambda done, total: calls.append((done, total)))
+    assert calls[-1] == (6, 6)

@@ -1,0 +1,90 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from ls3_torchrl.data import Tag, TagSampler
+
+
+def rows(tags, first=0):
+    n = len(tags)
+    return TensorDict(
+        {"tag": torch.tensor(tags, dtype=torch.uint8).unsqueeze(-1), "id": first + torch.arange(n).unsqueeze(-1)}, [n]
+    )
+
+
+def buffer_of(tags, wanted, capacity=64):
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), sampler=TagSampler(wanted))
+    buffer.extend(rows(tags))
+    return buffer
+
+
+def test_draws_uniformly_from_a_union_however_uneven_its_parts():
+    torch.manual_seed(0)
+    # 1 success and 9 constraint rows among 30: every one of the ten is due one tenth of the draws.
+    tags = [1] * 10 + [0] + [3] * 10 + [2] * 9
+    buffer = buffer_of(tags, ["success", "constraint"])
+    drawn = buffer.sample(20_000)["id"].flatten()
+    counts = torch.bincount(drawn, minlength=30)
+    wanted = [i for i, tag in enumerate(tags) if tag in (0, 2)]
+    assert counts.nonzero().flatten().tolist() == wanted
+    # Binomial: 2000 expected, standard deviation 42.
+    assert (counts[wanted] - 2000).abs().max() < 5 * 42
+
+
+def test_rows_are_the_indices_of_the_tags():
+    buffer = buffer_of([0, 1, 2, 3, 0], [Tag.SUCCESS, "online"])
+    assert buffer.sampler.rows(buffer.storage).tolist() == [0, 3, 4]
+
+
+@pytest.mark.parametrize("tags", [[], [0, 0, 3]])
+def test_a_tag_without_rows_says_which_and_what_to_do(tags):
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(8), sampler=TagSampler(["constraint", "rand"])
+    )
+    if tags:
+        buffer.extend(rows(tags))
+    with pytest.raises(RuntimeError, match=rf"{len(tags)} rows.*'rand', 'constraint'.*Collect"):
+        buffer.sampler.sample(buffer.storage, 2)
+
+
+def test_no_tag_at_all_is_refused():
+    with pytest.raises(ValueError, match="at least one tag"):
+        TagSampler([])
+
+
+def test_unknown_tag_is_refused():
+    with pytest.raises(ValueError, match="Unknown tag 'demo'"):
+        TagSampler(["demo"])
+
+
+def test_rows_written_after_a_draw_are_found():
+    buffer = buffer_of([0, 1], ["success"])
+    assert set(buffer.sample(50)["id"].flatten().tolist()) == {0}
+    buffer.extend(rows([1, 0], first=2))
+    assert set(buffer.sample(200)["id"].flatten().tolist()) == {0, 3}
+    buffer.add(rows([0], first=4)[0])
+    assert set(buffer.sample(200)["id"].flatten().tolist()) == {0, 3, 4}
+
+
+def test_rows_overwritten_by_another_tag_are_dropped():
+    buffer = buffer_of([0, 0, 1], ["success"], capacity=3)
+    buffer.sample(4)
+    buffer.extend(rows([1], first=3))  # the ring writes over row 0
+    assert set(buffer.sample(100)["id"].flatten().tolist()) == {1}
+
+
+def test_relabelled_rows_are_seen_after_refresh():
+    buffer = buffer_of([0, 1], ["success"])
+    buffer.sample(4)
+    buffer.storage[:]["tag"][1] = int(Tag.SUCCESS)
+    buffer.sampler.refresh()
+    assert buffer.sampler.rows(buffer.storage).tolist() == [0, 1]
+
+
+def test_nested_tag_key():
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(8), sampler=TagSampler(["rand"], tag_key=("meta", "tag"))
+    )
+    buffer.extend(TensorDict({"meta": {"tag": torch.tensor([[0], [1]], dtype=torch.uint8)}}, [2]))
+    assert buffer.sample(3)["meta", "tag"].flatten().tolist() == [1, 1, 1]

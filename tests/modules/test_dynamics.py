@@ -1,0 +1,196 @@
+"""EnsembleDynamics: the Gaussian of every member, and how particles pick members."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import step_mdp
+
+from ls3_torchrl.modules import EnsembleDynamics
+
+
+def shifting_dynamics(num_members: int, **options: object) -> EnsembleDynamics:
+    """Member m adds m to the latent, nearly without noise: the latent tells which member moved it."""
+    dynamics = EnsembleDynamics(1, 1, num_members=num_members, hidden=(), **options)
+    with torch.no_grad():
+        dynamics.network.weights[0].zero_()
+        dynamics.network.biases[0][:, 0, 0] = torch.arange(float(num_members))
+        dynamics.network.biases[0][:, 0, 1] = -100.0
+    return dynamics
+
+
+def members_used(td: TensorDict) -> torch.Tensor:
+    return (td["next", "latent"] - td["latent"]).round().long().flatten()
+
+
+def rest(rows: int) -> TensorDict:
+    return TensorDict({"latent": torch.zeros(rows, 1), "action": torch.zeros(rows, 1)}, [rows])
+
+
+def test_default_network_is_five_members_of_two_layers_of_128():
+    dynamics = EnsembleDynamics(latent_dim=32, action_dim=2)
+    assert [tuple(weight.shape) for weight in dynamics.network.weights] == [
+        (5, 34, 128),
+        (5, 128, 128),
+        (5, 128, 64),
+    ]
+    assert dynamics.propagation == "ts1"
+
+
+def test_next_latent_equals_a_computation_by_hand():
+    dynamics = EnsembleDynamics(2, 1, num_members=2, hidden=())
+    # Inputs (z0, z1, a); outputs (delta0, delta1, log_scale0, log_scale1) of each member.
+    weight = torch.zeros(2, 3, 4)
+    weight[0, 2, 0] = 2.0  # member 0: delta0 = 2 a
+    weight[1, 0, 1] = -1.0  # member 1: delta1 = -z0
+    weight[1, 2, 2] = 1.0  # member 1: log_scale0 = a + its bias
+    bias = torch.tensor([[[0.0, 0.1, math.log(0.5), 0.0]], [[0.3, 0.0, -1.0, math.log(2.0)]]])
+    with torch.no_grad():
+        dynamics.network.weights[0].copy_(weight)
+        dynamics.network.biases[0].copy_(bias)
+    td = TensorDict(
+        {
+            "latent": torch.tensor([[1.0, 2.0], [1.0, 2.0], [-3.0, 0.5]]),
+            "action": torch.tensor([[0.7], [0.7], [-2.0]]),
+            "dynamics_member": torch.tensor([[0], [1], [1]]),
+            "dynamics_noise": torch.tensor([[1.0, -1.0], [1.0, -1.0], [0.5, 2.0]]),
+        },
+        [3],
+    )
+    expected = torch.tensor(
+        [
+            [1.0 + 2 * 0.7 + 0.5 * 1.0, 2.0 + 0.1 + 1.0 * -1.0],
+            [1.0 + 0.3 + math.exp(0.7 - 1.0) * 1.0, 2.0 - 1.0 + 2.0 * -1.0],
+            [-3.0 + 0.3 + math.exp(-2.0 - 1.0) * 0.5, 0.5 + 3.0 + 2.0 * 2.0],
+        ]
+    )
+    torch.testing.assert_close(dynamics(td)["next", "latent"], expected)
+
+
+def test_distribution_gives_each_members_mean_and_scale_around_the_latent():
+    dynamics = EnsembleDynamics(3, 2, num_members=4, hidden=(8,))
+    latent, action = torch.randn(5, 3), torch.randn(5, 2)
+    loc, scale = dynamics.distribution(latent, action)
+    assert loc.shape == scale.shape == (5, 4, 3)
+    raw = dynamics.network(torch.cat([latent, action], -1))
+    torch.testing.assert_close(loc, latent[:, None] + raw[..., :3])
+    torch.testing.assert_close(scale, raw[..., 3:].exp())
+    # With one copy per member the answer is the same; a change of column 1 moves member 1 alone.
+    copies = latent[:, None].repeat(1, 4, 1), action[:, None].repeat(1, 4, 1)
+    per_member, _ = dynamics.distribution(*copies, per_member=True)
+    torch.testing.assert_close(per_member, loc)
+    copies[1][:, 1] += 1.0
+    moved = (dynamics.distribution(*copies, per_member=True)[0] != per_member).any(0).any(-1)
+    assert moved.tolist() == [False, True, False, False]
+
+
+def test_log_scale_is_clamped():
+    dynamics = EnsembleDynamics(1, 1, num_members=2, hidden=(), log_scale_bounds=(-2.0, 1.0))
+    with torch.no_grad():
+        dynamics.network.weights[0].zero_()
+        dynamics.network.biases[0][:, 0, 1] = torch.tensor([-50.0, 50.0])
+    _, scale = dynamics.distribution(torch.zeros(1, 1), torch.zeros(1, 1))
+    torch.testing.assert_close(scale.flatten(), torch.tensor([math.exp(-2.0), math.exp(1.0)]))
+
+
+def test_drawn_noise_has_the_members_scale():
+    dynamics = EnsembleDynamics(1, 1, num_members=1, hidden=())
+    with torch.no_grad():
+        dynamics.network.weights[0].zero_()
+        dynamics.network.biases[0].copy_(torch.tensor([[[3.0, math.log(0.25)]]]))
+    next_latent = dynamics(rest(20_000))["next", "latent"]
+    assert next_latent.mean().item() == pytest.approx(3.0, abs=0.01)
+    assert next_latent.std().item() == pytest.approx(0.25, rel=0.03)
+
+
+@pytest.mark.parametrize(("rows", "members"), [(20, 5), (7, 5), (3, 5), (1, 1), (11, 2)])
+def test_draw_members_splits_as_evenly_as_can_be(rows: int, members: int):
+    drawn = EnsembleDynamics(1, 1, num_members=members, hidden=()).draw_members(rows)
+    counts = torch.bincount(drawn, minlength=members)
+    assert drawn.dtype == torch.int64
+    assert counts.sum() == rows
+    assert len(counts) == members
+    assert counts.max() - counts.min() <= 1
+
+
+def test_every_member_is_as_likely_as_another_for_a_row():
+    dynamics = EnsembleDynamics(1, 1, num_members=5, hidden=())
+    # With 3 rows for 5 members the remainder must rotate too, else two members would never be drawn.
+    draws = torch.stack([dynamics.draw_members(3) for _ in range(2000)])
+    for row in range(3):
+        share = torch.bincount(draws[:, row], minlength=5) / 2000
+        torch.testing.assert_close(share, torch.full((5,), 0.2), atol=0.04, rtol=0)
+
+
+def test_ts1_draws_members_anew_at_every_step():
+    dynamics = shifting_dynamics(5)
+    td = dynamics(rest(40))
+    first = members_used(td)
+    assert "dynamics_member" not in td
+    td = step_mdp(td).set("action", torch.zeros(40, 1))
+    second = members_used(dynamics(td))
+    for used in (first, second):
+        assert torch.bincount(used, minlength=5).tolist() == [8] * 5
+    assert not torch.equal(first, second)
+
+
+def test_tsinf_keeps_each_particles_member():
+    dynamics = shifting_dynamics(5, propagation="tsinf")
+    td = dynamics(rest(40))
+    first = members_used(td)
+    assert torch.bincount(first, minlength=5).tolist() == [8] * 5
+    assert torch.equal(td["dynamics_member"].flatten(), first)
+    for _ in range(2):
+        td = dynamics(step_mdp(td).set("action", torch.zeros(40, 1)))
+        assert torch.equal(members_used(td), first)
+
+
+def test_given_members_and_noise_make_a_step_repeatable_in_any_batch_shape():
+    dynamics = EnsembleDynamics(3, 2, num_members=4, hidden=(8,))
+    td = TensorDict({"latent": torch.randn(2, 6, 3), "action": torch.randn(2, 6, 2)}, [2, 6])
+    td["dynamics_member"] = torch.randint(4, (2, 6, 1))
+    td["dynamics_noise"] = torch.randn(2, 6, 3)
+    first = dynamics(td.clone())["next", "latent"]
+    assert torch.equal(dynamics(td.clone())["next", "latent"], first)
+    flat = dynamics(td.clone().reshape(12))["next", "latent"]
+    torch.testing.assert_close(flat.reshape(2, 6, 3), first)
+
+
+def test_nested_keys():
+    dynamics = EnsembleDynamics(
+        3,
+        2,
+        num_members=4,
+        hidden=(8,),
+        latent_key=("model", "z"),
+        action_key=("agent", "action"),
+        next_latent_key=("next", "model", "z"),
+        member_key=("model", "member"),
+        noise_key=("model", "noise"),
+        propagation="tsinf",
+    )
+    latent, noise = torch.randn(6, 3), torch.randn(6, 3)
+    td = TensorDict({"model": {"z": latent, "noise": noise}, "agent": {"action": torch.randn(6, 2)}}, [6])
+    dynamics(td)
+    member = td["model", "member"]
+    loc, scale = dynamics.distribution(latent, td["agent", "action"])
+    rows = torch.arange(6)
+    expected = loc[rows, member[:, 0]] + scale[rows, member[:, 0]] * noise
+    torch.testing.assert_close(td["next", "model", "z"], expected)
+    assert dynamics.in_keys == [("model", "z"), ("agent", "action")]
+
+
+def test_missing_keys_are_named():
+    dynamics = EnsembleDynamics(3, 2, hidden=(8,))
+    with pytest.raises(KeyError, match=r"\['action'\].*It has: latent"):
+        dynamics(TensorDict({"latent": torch.zeros(4, 3)}, [4]))
+
+
+def test_bad_options_are_refused():
+    with pytest.raises(ValueError, match="propagation must be one of 'ts1', 'tsinf'; got 'ts2'"):
+        EnsembleDynamics(3, 2, propagation="ts2")
+    with pytest.raises(ValueError, match="log_scale_bounds must rise"):
+        EnsembleDynamics(3, 2, log_scale_bounds=(1.0, 1.0))
+    with pytest.raises(ValueError, match="num_members must be at least 1"):
+        EnsembleDynamics(3, 2, num_members=0)

@@ -1,0 +1,138 @@
+"""Equation (2) restated by hand: the Gaussian negative log-likelihood of the next latent."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from ls3_torchrl.modules import EnsembleDynamics
+from ls3_torchrl.objectives import EnsembleDynamicsLoss
+
+DELTA = (0.5, -1.0)  # what each of two members adds to a latent of one dimension
+SCALE = (0.5, 2.0)
+
+
+def constant_dynamics() -> EnsembleDynamics:
+    dynamics = EnsembleDynamics(1, 1, num_members=2, hidden=())
+    with torch.no_grad():
+        dynamics.network.weights[0].zero_()
+        for m in range(2):
+            dynamics.network.biases[0][m, 0] = torch.tensor([DELTA[m], math.log(SCALE[m])])
+    return dynamics
+
+
+def log_density(x: float, mean: float, std: float) -> float:
+    return -0.5 * ((x - mean) / std) ** 2 - math.log(std) - 0.5 * math.log(2 * math.pi)
+
+
+def transitions(latent: list, next_latent: list) -> TensorDict:
+    z, z_next = torch.tensor(latent).unsqueeze(-1), torch.tensor(next_latent).unsqueeze(-1)
+    return TensorDict({"latent": z, "action": torch.zeros_like(z), "next": {"latent": z_next}}, z.shape[:-1])
+
+
+def test_loss_is_the_gaussian_negative_log_likelihood_over_rows_and_members():
+    z, z_next = [0.0, 2.0, -1.0], [0.4, 2.0, 1.5]
+    out = EnsembleDynamicsLoss(constant_dynamics())(transitions(z, z_next))
+    pairs = [(a, b, m) for a, b in zip(z, z_next, strict=True) for m in range(2)]
+    nll = -sum(log_density(b, a + DELTA[m], SCALE[m]) for a, b, m in pairs) / 6
+    error = sum((a + DELTA[m] - b) ** 2 for a, b, m in pairs) / 6
+    assert out["loss_dynamics"].item() == pytest.approx(nll, rel=1e-5)
+    assert out["prediction_error"].item() == pytest.approx(error, rel=1e-5)
+    assert out["loss_dynamics"].requires_grad
+    assert not out["prediction_error"].requires_grad
+
+
+def test_latent_dimensions_are_averaged():
+    dynamics = EnsembleDynamics(2, 1, num_members=1, hidden=())
+    with torch.no_grad():
+        dynamics.network.weights[0].zero_()
+        dynamics.network.biases[0].copy_(torch.tensor([[[1.0, 2.0, math.log(0.5), math.log(3.0)]]]))
+    td = TensorDict(
+        {"latent": torch.zeros(1, 2), "action": torch.zeros(1, 1), "next": {"latent": torch.tensor([[0.0, 5.0]])}},
+        [1],
+    )
+    expected = -(log_density(0.0, 1.0, 0.5) + log_density(5.0, 2.0, 3.0)) / 2
+    assert EnsembleDynamicsLoss(dynamics)(td)["loss_dynamics"].item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_bootstrap_column_m_teaches_member_m():
+    z, z_next = [[0.0, 1.0], [2.0, -1.0]], [[0.4, 3.0], [2.0, 1.5]]
+    out = EnsembleDynamicsLoss(constant_dynamics(), bootstrap=True)(transitions(z, z_next))
+    cells = [(i, m) for i in range(2) for m in range(2)]
+    nll = -sum(log_density(z_next[i][m], z[i][m] + DELTA[m], SCALE[m]) for i, m in cells) / 4
+    assert out["loss_dynamics"].item() == pytest.approx(nll, rel=1e-5)
+
+
+def test_bootstrap_gradient_of_a_member_ignores_the_other_columns():
+    def gradient(next_latents: list) -> torch.Tensor:
+        dynamics = constant_dynamics()
+        batch = transitions([[0.0, 1.0]], next_latents)
+        EnsembleDynamicsLoss(dynamics, bootstrap=True)(batch)["loss_dynamics"].backward()
+        return dynamics.network.biases[0].grad
+
+    before, after = gradient([[0.4, 3.0]]), gradient([[0.4, -7.0]])
+    assert torch.equal(before[0], after[0])
+    assert not torch.equal(before[1], after[1])
+
+
+def test_equal_bootstrap_columns_equal_the_shared_batch():
+    dynamics = EnsembleDynamics(3, 2, num_members=4, hidden=(8,))
+    shared = TensorDict(
+        {"latent": torch.randn(5, 3), "action": torch.randn(5, 2), "next": {"latent": torch.randn(5, 3)}}, [5]
+    )
+    columns = shared.unsqueeze(1).expand(5, 4).contiguous()
+    plain = EnsembleDynamicsLoss(dynamics)(shared)
+    bootstrapped = EnsembleDynamicsLoss(dynamics, bootstrap=True)(columns)
+    torch.testing.assert_close(plain["loss_dynamics"], bootstrapped["loss_dynamics"])
+    torch.testing.assert_close(plain["prediction_error"], bootstrapped["prediction_error"])
+
+
+@pytest.mark.parametrize("columns", [[0.0, 1.0], [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]])
+def test_a_bootstrap_batch_needs_one_column_per_member(columns: list):
+    loss = EnsembleDynamicsLoss(constant_dynamics(), bootstrap=True)
+    with pytest.raises(ValueError, match=r"latents of shape \[B, 2, D\]"):
+        loss(transitions(columns, columns))
+
+
+def test_nested_keys_of_loss_and_module():
+    dynamics = EnsembleDynamics(
+        3, 2, hidden=(8,), latent_key=("m", "z"), action_key=("m", "a"), next_latent_key=("m", "z2")
+    )
+    loss = EnsembleDynamicsLoss(dynamics)
+    loss.set_keys(latent=("now", "z"), action=("agent", "a"), next_latent=("later", "z"))
+    z, a, z_next = torch.randn(5, 3), torch.randn(5, 2), torch.randn(5, 3)
+    nested = loss(TensorDict({"now": {"z": z}, "agent": {"a": a}, "later": {"z": z_next}}, [5]))
+    flat = EnsembleDynamicsLoss(dynamics)(TensorDict({"latent": z, "action": a, "next": {"latent": z_next}}, [5]))
+    assert torch.equal(nested["loss_dynamics"], flat["loss_dynamics"])
+
+
+def test_misspelt_and_missing_keys():
+    loss = EnsembleDynamicsLoss(constant_dynamics())
+    with pytest.raises(ValueError, match="latents is not an accepted tensordict key"):
+        loss.set_keys(latents="z")
+    batch = transitions([0.0], [1.0])
+    del batch["next", "latent"]
+    with pytest.raises(KeyError, match=r"EnsembleDynamicsLoss needs the keys \[\('next', 'latent'\)\]"):
+        loss(batch)
+
+
+def test_dynamics_overfit_eight_transitions(minimise):
+    batch = TensorDict(
+        {"latent": torch.randn(8, 4), "action": torch.randn(8, 2), "next": {"latent": torch.randn(8, 4)}}, [8]
+    )
+    loss = EnsembleDynamicsLoss(EnsembleDynamics(4, 2))
+    before = loss(batch)["prediction_error"].item()
+    first, last = minimise(loss, batch, "loss_dynamics", steps=150, lr=3e-3)
+    assert last < first - 1.5  # nats a dimension: the predicted spread shrinks with the error
+    assert loss(batch)["prediction_error"].item() < 0.05 * before
+
+
+def test_predicted_scale_settles_at_the_spread_of_the_data(minimise):
+    # The likelihood's optimum for one state with two equally frequent outcomes ±0.5 is N(0, 0.5²).
+    batch = transitions([0.0, 0.0], [0.5, -0.5])
+    dynamics = EnsembleDynamics(1, 1, num_members=1, hidden=())
+    minimise(EnsembleDynamicsLoss(dynamics), batch, "loss_dynamics", steps=300, lr=3e-2)
+    loc, scale = dynamics.distribution(torch.zeros(1, 1), torch.zeros(1, 1))
+    assert loc.item() == pytest.approx(0.0, abs=0.02)
+    assert scale.item() == pytest.approx(0.5, rel=0.03)

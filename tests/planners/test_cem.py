@@ -1,0 +1,339 @@
+import pytest
+import torch
+
+from ls3_torchrl.planners import CrossEntropyMethod, Judgement
+
+LOW, HIGH = torch.tensor([-3.0, 0.5]), torch.tensor([-1.0, 2.0])
+
+
+def quadratic(target):
+    def judge(actions, rows, restarts, population):
+        score = -(actions - torch.as_tensor(target)).square().sum((-1, -2))
+        return Judgement(score, torch.ones_like(score, dtype=torch.bool), score)
+
+    return judge
+
+
+class Record:
+    """Passes a judgement on and remembers everything that was asked."""
+
+    def __init__(self, judge):
+        self.judge, self.asked = judge, []
+
+    def __call__(self, actions, rows, restarts, population):
+        judgement = self.judge(actions, rows, restarts, population)
+        self.asked.append((actions.clone(), rows.clone(), restarts.clone(), population, judgement))
+        return judgement
+
+
+def table(batch, cem, horizon, action_dim=2, seed=0):
+    """Noise that depends on row and population alone, whatever else is asked for."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (cem.max_populations, batch, cem.num_candidates, horizon, action_dim)
+    normal, uniform = torch.randn(shape, generator=generator), torch.rand(shape, generator=generator)
+    return normal, uniform, lambda rows, population: (normal[population][rows], uniform[population][rows])
+
+
+def test_finds_the_optimum_inside_the_box():
+    torch.manual_seed(0)
+    cem = CrossEntropyMethod(num_candidates=200, num_elites=20, optim_steps=10)
+    result = cem(quadratic([-2.4, 1.1]), LOW, HIGH, batch=2, horizon=3)
+    assert (result.actions - torch.tensor([-2.4, 1.1])).abs().max() < 0.05
+    assert (result.mean - torch.tensor([-2.4, 1.1])).abs().max() < 0.05
+    assert not result.fallback.any()
+
+
+def test_finds_an_optimum_at_a_corner_of_asymmetric_bounds():
+    torch.manual_seed(0)
+    cem = CrossEntropyMethod(num_candidates=200, num_elites=20, optim_steps=10)
+    result = cem(quadratic([5.0, -5.0]), LOW, HIGH, batch=2, horizon=3)
+    assert (result.actions - torch.tensor([-1.0, 0.5])).abs().max() < 0.02
+
+
+@pytest.mark.parametrize("p_random", [0.0, 0.4, 1.0])
+def test_every_candidate_and_result_lies_in_the_box(p_random):
+    torch.manual_seed(0)
+    cem = CrossEntropyMethod(num_candidates=60, num_elites=5, optim_steps=4, p_random=p_random, min_std=0.5)
+    record = Record(quadratic([9.0, 9.0]))
+    # The warm start lies far out.
+    start = torch.full((2, 3, 2), 10.0)
+    result = cem(record, LOW, HIGH, batch=2, horizon=3, mean=start, std=start)
+    for values in (*(actions for actions, *_ in record.asked), result.actions, result.mean):
+        assert (values >= LOW).all()
+        assert (values <= HIGH).all()
+
+
+def test_one_elite_refits_on_the_best_alone():
+    torch.manual_seed(0)
+    cem = CrossEntropyMethod(num_candidates=50, num_elites=1, optim_steps=3, min_std=0.0)
+    record = Record(quadratic([-2.0, 1.0]))
+    result = cem(record, LOW, HIGH, batch=1, horizon=2)
+    actions, *_, judgement = record.asked[0]
+    torch.testing.assert_close(result.actions[0], actions[0, judgement.score[0].argmax()])
+    torch.testing.assert_close(result.mean, result.actions)
+    assert (result.std == 0).all()
+    # Without any spread the later rounds repeat it.
+    assert (record.asked[2][0] == result.actions[:, None]).all()
+
+
+def test_min_std_is_a_share_of_each_side():
+    torch.manual_seed(0)
+    cem = CrossEntropyMethod(num_candidates=50, num_elites=1, optim_steps=2, min_std=0.1)
+    result = cem(quadratic([-2.0, 1.0]), LOW, HIGH, batch=1, horizon=2)
+    torch.testing.assert_close(result.std, torch.tensor([0.2, 0.15]).expand(1, 2, 2))
+
+
+def test_elites_refit_by_hand():
+    torch.manual_seed(0)
+    cem = CrossEntropyMethod(num_candidates=30, num_elites=4, optim_steps=1)
+    record = Record(quadratic([-2.0, 1.0]))
+    result = cem(record, LOW, HIGH, batch=2, horizon=2)
+    actions, *_, judgement = record.asked[0]
+    for row in range(2):
+        elite = actions[row, judgement.score[row].argsort(descending=True)[:4]]
+        torch.testing.assert_close(result.mean[row], elite.mean(0))
+        torch.testing.assert_close(result.std[row], elite.std(0, correction=0))
+
+
+def test_elites_come_from_feasible_candidates_even_if_they_are_few():
+    torch.manual_seed(0)
+
+    def three_bad_ones(actions, rows, restarts, population):
+        score = -torch.arange(10.0).expand(1, -1)  # the infeasible ones score best
+        return Judgement(score, torch.arange(10).expand(1, -1) >= 7, score)
+
+    record = Record(three_bad_ones)
+    result = CrossEntropyMethod(num_candidates=10, num_elites=5, optim_steps=1)(record, LOW, HIGH, batch=1, horizon=2)
+    few = record.asked[0][0][0, 7:]
+    torch.testing.assert_close(result.mean[0], few.mean(0))
+    torch.testing.assert_close(result.std[0], few.std(0, correction=0))
+    assert torch.equal(result.actions[0], few[0])
+    assert result.score.tolist() == [-7.0]
+    assert not result.fallback
+
+
+def test_nan_ranks_last():
+    torch.manual_seed(0)
+
+    def mostly_nan(actions, rows, restarts, population):
+        score = torch.full((1, 10), torch.nan)
+        score[0, 3], score[0, 8] = -50.0, -60.0
+        return Judgement(score, torch.ones(1, 10, dtype=torch.bool), torch.zeros(1, 10))
+
+    record = Record(mostly_nan)
+    result = CrossEntropyMethod(num_candidates=10, num_elites=5, optim_steps=1)(record, LOW, HIGH, batch=1, horizon=2)
+    actions = record.asked[0][0][0]
+    assert torch.equal(result.actions[0], actions[3])
+    torch.testing.assert_close(result.mean[0], actions[[3, 8]].mean(0))
+
+
+@pytest.mark.parametrize("worthless", [torch.nan, -torch.inf])
+def test_scores_that_rank_nothing_count_as_infeasible_and_never_leave_the_box(worthless):
+    torch.manual_seed(0)
+
+    def judge(actions, rows, restarts, population):
+        score = torch.full((1, 10), worthless)
+        fallback = torch.full((1, 10), torch.nan)
+        fallback[0, 4] = -1e6
+        return Judgement(score, torch.ones(1, 10, dtype=torch.bool), fallback)
+
+    record = Record(judge)
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=5, optim_steps=2, max_restarts=1)
+    result = cem(record, LOW, HIGH, batch=1, horizon=2)
+    assert result.fallback.tolist() == [True]
+    # The only candidate with a ranking wins over those without.
+    assert torch.equal(result.actions[0], record.asked[-1][0][0, 4])
+    assert result.mean.isfinite().all()
+    assert result.std.isfinite().all()
+
+
+@pytest.mark.parametrize("max_restarts", [0, 1, 3])
+def test_nothing_feasible_restarts_and_then_takes_the_best_fallback(max_restarts):
+    torch.manual_seed(0)
+
+    def never(actions, rows, restarts, population):
+        ranking = actions[..., 0].sum(-1)
+        return Judgement(-ranking, torch.zeros_like(ranking, dtype=torch.bool), ranking)
+
+    record = Record(never)
+    cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3, max_restarts=max_restarts)
+    result = cem(record, LOW, HIGH, batch=2, horizon=2)
+    assert result.fallback.tolist() == [True, True]
+    assert result.restarts.tolist() == [max_restarts] * 2
+    assert result.populations.tolist() == [max_restarts + 1] * 2
+    assert [asked[2].tolist() for asked in record.asked] == [[k, k] for k in range(max_restarts + 1)]
+    actions, *_, judgement = record.asked[-1]
+    for row in range(2):
+        best = judgement.fallback[row].argmax()
+        assert torch.equal(result.actions[row], actions[row, best])
+        assert result.score[row] == judgement.fallback[row, best]
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_feasible_only_after_k_restarts(k):
+    torch.manual_seed(0)
+
+    def later(actions, rows, restarts, population):
+        score = -(actions + 2).square().sum((-1, -2))
+        return Judgement(score, (restarts >= k)[:, None].expand_as(score), score)
+
+    cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3, max_restarts=4)
+    result = cem(later, LOW, HIGH, batch=1, horizon=2)
+    assert result.restarts.tolist() == [k]
+    assert result.populations.tolist() == [k + 3]  # the failed ones, then all rounds
+    assert result.fallback.tolist() == [False]
+
+
+def test_a_restart_begins_again_from_the_given_gaussian():
+    # Feasible at first, nothing in the second round, feasible again after the restart.
+    def judge(actions, rows, restarts, population):
+        score = actions[..., 0].sum(-1)
+        return Judgement(score, torch.full_like(score, population != 1, dtype=torch.bool), score)
+
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=2, max_restarts=2, p_random=0.0)
+    normal, _, noise = table(1, cem, 2)
+    record = Record(judge)
+    mean = torch.tensor([-2.0, 1.2]).expand(1, 2, 2)
+    std = torch.full((1, 2, 2), 0.1)
+    result = cem(record, LOW, HIGH, batch=1, horizon=2, mean=mean, std=std, noise=noise)
+    assert result.restarts.tolist() == [1]
+    assert result.populations.tolist() == [4]
+    torch.testing.assert_close(record.asked[2][0], (mean[:, None] + 0.1 * normal[2]).clamp(LOW, HIGH))
+    refitted = record.asked[3][0]
+    assert not torch.allclose(refitted, (mean[:, None] + 0.1 * normal[3]).clamp(LOW, HIGH))
+
+
+def test_a_feasible_sequence_of_an_earlier_round_beats_a_fallback():
+    torch.manual_seed(0)
+
+    def only_at_first(actions, rows, restarts, population):
+        score = actions[..., 0].sum(-1)
+        return Judgement(score, torch.full_like(score, population == 0, dtype=torch.bool), -score)
+
+    record = Record(only_at_first)
+    cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3, max_restarts=1)
+    result = cem(record, LOW, HIGH, batch=1, horizon=2)
+    assert result.fallback.tolist() == [False]
+    actions, *_, judgement = record.asked[0]
+    assert torch.equal(result.actions[0], actions[0, judgement.score[0].argmax()])
+    assert result.score[0] == judgement.score.max()
+
+
+def test_rows_are_independent():
+    # Row 0 is easy, row 1 restarts twice, row 2 never succeeds: all are at different rounds at the same time.
+    needs = torch.tensor([0, 2, 99])
+    targets = torch.tensor([[-2.4, 1.1], [-1.2, 0.6], [-2.9, 1.9]])
+
+    def judge_of(which):
+        def judge(actions, rows, restarts, population):
+            row = which[rows]
+            score = -(actions - targets[row][:, None, None]).square().sum((-1, -2))
+            return Judgement(score, (restarts >= needs[row])[:, None].expand_as(score), 2 * score)
+
+        return judge
+
+    cem = CrossEntropyMethod(num_candidates=40, num_elites=5, optim_steps=3, max_restarts=3, p_random=0.5)
+    normal, uniform, noise = table(3, cem, 2)
+    start = {"mean": torch.tensor([-2.0, 1.0]) + 0.1 * torch.randn(3, 2, 2), "std": 0.3 * torch.rand(3, 2, 2)}
+    together = cem(judge_of(torch.arange(3)), LOW, HIGH, batch=3, horizon=2, noise=noise, **start)
+    assert together.populations.tolist() == [3, 5, 4]
+    for i in range(3):
+        alone = cem(
+            judge_of(torch.tensor([i])),
+            LOW,
+            HIGH,
+            batch=1,
+            horizon=2,
+            noise=lambda rows, k, i=i: (normal[k, i : i + 1], uniform[k, i : i + 1]),
+            **{name: value[i : i + 1] for name, value in start.items()},
+        )
+        for name in together._fields:
+            torch.testing.assert_close(getattr(together, name)[i : i + 1], getattr(alone, name), msg=name)
+
+
+@pytest.mark.parametrize(("p_random", "expected"), [(0.0, 0), (0.3, 3), (0.96, 10), (1.0, 10)])
+def test_p_random_shares_the_first_round_between_box_and_warm_start(p_random, expected):
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=2, p_random=p_random)
+    record = Record(quadratic([-2.0, 1.0]))
+    warm = torch.tensor([-1.5, 1.5]).expand(1, 2, 2)
+    # Without normal noise whatever is not uniform sits exactly at the mean.
+    _, uniform, _ = table(1, cem, 2)
+    noise = lambda rows, k: (torch.zeros(1, 10, 2, 2), uniform[k])  # noqa: E731
+    result = cem(record, LOW, HIGH, batch=1, horizon=2, mean=warm, std=warm.abs(), noise=noise)
+    first, second = record.asked[0][0][0], record.asked[1][0][0]
+    at_warm = (first == warm).all(-1).all(-1)
+    assert int((~at_warm).sum()) == expected
+    torch.testing.assert_close(first[:expected], LOW + (HIGH - LOW) * uniform[0, 0, :expected])
+    # Later rounds are the refitted Gaussian alone.
+    assert (second == second[:1]).all()
+    assert result.populations.tolist() == [2]
+
+
+def test_without_a_start_the_gaussian_covers_the_box():
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=1, p_random=0.0)
+    normal, _, noise = table(1, cem, 2)
+    record = Record(quadratic([-2.0, 1.0]))
+    cem(record, LOW, HIGH, batch=1, horizon=2, noise=noise)
+    middle, quarter = torch.tensor([-2.0, 1.25]), torch.tensor([0.5, 0.375])
+    torch.testing.assert_close(record.asked[0][0], (middle + quarter * normal[0]).clamp(LOW, HIGH))
+
+
+def test_every_population_is_scored_and_the_result_is_one_of_them():
+    torch.manual_seed(0)
+    cem = CrossEntropyMethod(num_candidates=30, num_elites=5, optim_steps=4)
+    record, drawn = Record(quadratic([-2.0, 1.0])), []
+
+    def noise(rows, population):
+        drawn.append(population)
+        return cem.draw(rows, 2, 2)
+
+    result = cem(record, LOW, HIGH, batch=3, horizon=2, noise=noise)
+    assert drawn == [asked[3] for asked in record.asked] == [0, 1, 2, 3]
+    assert result.populations.tolist() == [4, 4, 4]
+    scores = torch.stack([asked[-1].score for asked in record.asked])  # [K, B, N]
+    torch.testing.assert_close(result.score, scores.amax((0, 2)))
+    for row in range(3):
+        seen = torch.cat([asked[0][row] for asked in record.asked])
+        assert (seen == result.actions[row]).all(-1).all(-1).any()
+
+
+def test_finished_rows_are_not_judged_any_more():
+    torch.manual_seed(0)
+
+    def judge(actions, rows, restarts, population):
+        score = actions[..., 0].sum(-1)
+        return Judgement(score, ((rows == 0) | (restarts >= 1))[:, None].expand_as(score), score)
+
+    record = Record(judge)
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=2, max_restarts=1)
+    result = cem(record, LOW, HIGH, batch=2, horizon=1)
+    assert [asked[1].tolist() for asked in record.asked] == [[0, 1], [0, 1], [1]]
+    assert result.populations.tolist() == [2, 3]
+
+
+def test_the_given_start_is_left_as_it_was():
+    torch.manual_seed(0)
+    mean, std = torch.full((1, 2, 2), -1.5), torch.full((1, 2, 2), 0.2)
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=2)
+    cem(quadratic([-2.0, 1.0]), LOW, HIGH, batch=1, horizon=2, mean=mean, std=std)
+    assert (mean == -1.5).all()
+    assert (std == 0.2).all()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"num_candidates": 0}, "num_candidates must be at least 1"),
+        ({"num_elites": 0}, "num_elites must lie between 1 and num_candidates = 10, got 0"),
+        ({"num_elites": 11}, "num_elites must lie between 1 and num_candidates = 10, got 11"),
+        ({"optim_steps": 0}, "optim_steps must be at least 1"),
+        ({"max_restarts": -1}, "max_restarts must be at least 0"),
+        ({"p_random": 1.1}, r"p_random must lie in \[0, 1\]"),
+        ({"p_random": -0.1}, r"p_random must lie in \[0, 1\]"),
+        ({"min_std": -0.1}, "min_std must not be negative"),
+    ],
+)
+def test_settings_out_of_range_are_refused(wrong, message):
+    settings = {"num_candidates": 10, "num_elites": 2, "optim_steps": 2} | wrong
+    with pytest.raises(ValueError, match=message):
+        CrossEntropyMethod(**settings)

@@ -1,0 +1,175 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.data import Bounded
+
+from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
+from ls3_torchrl.planners import FusedImagination, ImaginationNoise, LatentEnv, RolloutImagination
+from ls3_torchrl.planners.fused import fastest_precision, run_layers
+
+D, A, M = 4, 2, 3
+B, N, H, P = 2, 7, 3, 4
+NAMES = ("dynamics", "constraint", "goal", "value", "safe_set")
+
+
+def build(seed=0):
+    torch.manual_seed(seed)
+    return {
+        "dynamics": EnsembleDynamics(D, A, num_members=M, hidden=(8,)),
+        "constraint": ConstraintEstimator(D, hidden=(8,)),
+        "goal": GoalEstimator(D, hidden=(8,)),
+        "value": ValueEnsemble(D, num_members=2, hidden=(8,)),
+        "safe_set": SafeSet(D, hidden=(8,)),
+    }
+
+
+def env_of(parts):
+    spec = Bounded(low=-1.0, high=1.0, shape=(A,))
+    return LatentEnv(parts["dynamics"], parts["constraint"], parts["goal"], action_spec=spec)
+
+
+def fused_of(parts, **options):
+    return FusedImagination(env_of(parts), parts["value"], parts["safe_set"], **options)
+
+
+def problem():
+    torch.manual_seed(1)
+    noise = ImaginationNoise(torch.randint(M, (H, P)), torch.randn(B, H, P, N, D))
+    return torch.randn(B, D), torch.rand(B, N, H, A) * 2 - 1, noise
+
+
+def assert_same(got, want):
+    for name, one, other in zip(got._fields, got, want, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5, msg=name)
+
+
+def test_bf16_stays_close_relative_to_the_spread_of_plans():
+    parts = build()
+    latent, actions, noise = problem()
+    exact = fused_of(parts, precision="fp32")(latent, actions, noise)
+    rough = fused_of(parts, precision="bf16")(latent, actions, noise)
+    for name, one, other in zip(exact._fields, rough, exact, strict=True):
+        assert one.dtype == torch.float32
+        scale = max(float(other.abs().max()), float(other.std()))
+        assert (one - other).abs().max() < 0.05 * scale, name
+    # It did run in another precision.
+    assert not torch.equal(exact.value, rough.value)
+
+
+# One candidate, some of the seven, all of them, and then two, three and all four particles at a time.
+@pytest.mark.parametrize("block", [1, 3, 7, 14, 21, 100])
+def test_blocks_are_a_matter_of_speed_only(block):
+    parts = build()
+    latent, actions, noise = problem()
+    whole = fused_of(parts, precision="fp32")(latent, actions, noise)
+    assert_same(fused_of(parts, precision="fp32", block=block)(latent, actions, noise), whole)
+    common = ImaginationNoise(noise.members, noise.noise[:, :, :, :1])
+    whole = fused_of(parts, precision="fp32")(latent, actions, common)
+    assert_same(fused_of(parts, precision="fp32", block=block)(latent, actions, common), whole)
+
+
+def test_a_snapshot_is_taken_only_when_something_changed():
+    imagine = fused_of(build(), precision="fp32")
+    assert imagine.refresh() is True
+    assert imagine.refresh() is False
+    imagine(*problem())
+    assert imagine.refresh() is False
+
+
+@pytest.mark.parametrize("fused", [False, True], ids=["Adam", "fused Adam"])
+@pytest.mark.parametrize("name", NAMES)
+def test_weights_after_an_optimiser_step_are_used(name, fused):
+    parts = build()
+    imagine = fused_of(parts, precision="fp32")
+    before = imagine(*problem())
+    module = parts[name]
+    optimizer = torch.optim.Adam(module.parameters(), lr=0.1, fused=fused)
+    sum(p.square().sum() for p in module.parameters()).backward()
+    optimizer.step()
+    after = imagine(*problem())
+    assert any(not torch.allclose(one, other, atol=1e-4) for one, other in zip(before, after, strict=True))
+    assert_same(after, fused_of(parts, precision="fp32")(*problem()))
+
+
+def test_weights_after_load_state_dict_are_used():
+    parts, others = build(0), build(1)
+    imagine = fused_of(parts, precision="fp32")
+    imagine(*problem())
+    for name in NAMES:
+        parts[name].load_state_dict(others[name].state_dict())
+    assert_same(imagine(*problem()), fused_of(others, precision="fp32")(*problem()))
+
+
+def test_the_snapshot_does_not_alias_the_networks():
+    parts = build()
+    imagine = fused_of(parts, precision="fp32")
+    before = imagine(*problem())
+    imagine.refresh = lambda: False
+    with torch.no_grad():
+        for name in NAMES:
+            for parameter in parts[name].parameters():
+                parameter.zero_()
+    assert_same(imagine(*problem()), before)
+
+
+def test_inputs_are_left_as_they_were():
+    latent, actions, noise = problem()
+    copies = latent.clone(), actions.clone(), noise.noise.clone()
+    fused_of(build(), precision="fp32")(latent, actions, noise)
+    assert all(torch.equal(a, b) for a, b in zip(copies, (latent, actions, noise.noise), strict=True))
+
+
+def test_log_scales_are_clamped_as_in_the_module():
+    parts = build()
+    with torch.no_grad():  # one half of the log standard deviations far above the bound, one far below
+        bias = parts["dynamics"].network.biases[-1]
+        bias[..., D : D + 2], bias[..., D + 2 :] = 50.0, -50.0
+    plain = RolloutImagination(env_of(parts), parts["value"], parts["safe_set"])(*problem())
+    for got, want in zip(fused_of(parts, precision="fp32")(*problem()), plain, strict=True):
+        torch.testing.assert_close(got, want, atol=1e-3, rtol=1e-4)
+
+
+def test_auto_settles_on_what_was_measured():
+    assert fastest_precision("cpu") in ("fp32", "bf16")
+    imagine = fused_of(build(), precision="auto")
+    imagine(*problem())
+    expected = {"fp32": torch.float32, "bf16": torch.bfloat16}[fastest_precision("cpu")]
+    assert imagine._dtype == expected
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_layers_run_as_a_relu_network(dtype):
+    torch.manual_seed(0)
+    net = nn.Sequential(nn.Linear(5, 16), nn.ReLU(), nn.Linear(16, 16), nn.ReLU(), nn.Linear(16, 3))
+    layers = [(m.weight.detach().to(dtype), m.bias.detach().to(dtype)) for m in net if isinstance(m, nn.Linear)]
+    x = torch.randn(40, 5)
+    tolerance = 1e-6 if dtype == torch.float32 else 0.02
+    torch.testing.assert_close(run_layers(x.to(dtype), layers).float(), net(x).detach(), atol=tolerance, rtol=0)
+
+
+def test_unknown_precision_is_refused():
+    with pytest.raises(ValueError, match="precision must be one of 'auto', 'fp32', 'bf16'; got 'fp16'"):
+        fused_of(build(), precision="fp16")
+
+
+class OwnValue(nn.Module):
+    """A value function of the user's own."""
+
+    in_keys, out_keys = ("latent",), ("state_value",)
+
+    def forward(self, tensordict: TensorDict) -> TensorDict:
+        return tensordict.set("state_value", tensordict["latent"][..., None, :1])
+
+
+def test_other_networks_are_refused_with_the_way_out():
+    parts = build() | {"value": OwnValue()}
+    assert not FusedImagination.supports(env_of(parts), parts["value"], parts["safe_set"])
+    with pytest.raises(TypeError, match='engine="rollout"'):
+        fused_of(parts)
+
+
+def test_a_classifier_with_another_activation_is_not_mistaken_for_a_relu_network():
+    parts = build()
+    parts["goal"].network = nn.Sequential(nn.Linear(D, 8), nn.Tanh(), nn.Linear(8, 1))
+    assert not FusedImagination.supports(env_of(parts), parts["value"], parts["safe_set"])

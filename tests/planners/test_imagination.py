@@ -1,0 +1,133 @@
+import itertools
+
+import pytest
+import torch
+from torchrl.data import Bounded
+
+from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
+from ls3_torchrl.planners import FusedImagination, ImaginationNoise, LatentEnv, RolloutImagination
+from ls3_torchrl.planners.imagination import draw_members
+
+D, A, M = 4, 2, 3
+B, N, H, P = 2, 6, 3, 5
+
+
+def modules(propagation="ts1"):
+    torch.manual_seed(0)
+    env = LatentEnv(
+        EnsembleDynamics(D, A, num_members=M, hidden=(8,), propagation=propagation),
+        ConstraintEstimator(D, hidden=(8,)),
+        GoalEstimator(D, hidden=(8,)),
+        action_spec=Bounded(low=-1.0, high=1.0, shape=(A,)),
+    )
+    return env, ValueEnsemble(D, num_members=2, hidden=(8,)), SafeSet(D, hidden=(8,))
+
+
+def problem(*, common=True, fixed=False):
+    torch.manual_seed(1)
+    members = draw_members(M, H, P, fixed=fixed, device=torch.device("cpu"))
+    noise = ImaginationNoise(members, torch.randn(B, H, P, 1 if common else N, D))
+    return 2 * torch.randn(B, D), torch.rand(B, N, H, A) * 2 - 1, noise
+
+
+def particle_by_particle(env, value, safe_set, latent, actions, noise, reduction):
+    """The definition, one particle of one plan at a time."""
+    shapes = [(B, N, P, 2), (B, N, P, H), (B, N, P, H), (B, N, P)]
+    values, goals, constraints, safe = (torch.zeros(shape) for shape in shapes)
+    with torch.no_grad():
+        for b, n, p in itertools.product(range(B), range(N), range(P)):
+            z = latent[b]
+            for t in range(H):
+                loc, scale = env.dynamics.distribution(z, actions[b, n, t])
+                member, own = noise.members[t, p], noise.noise[b, t, p]
+                z = loc[member] + scale[member] * own[n if len(own) > 1 else 0]
+                goals[b, n, p, t] = env.goal.probability(z).squeeze()
+                constraints[b, n, p, t] = env.constraint.probability(z).squeeze()
+            values[b, n, p] = value.network(z).squeeze(-1)
+            safe[b, n, p] = safe_set.probability(z).squeeze()
+    constraint = constraints.amax(2) if reduction == "max" else constraints.mean(2)
+    return values.mean(2), goals.mean(2), constraint, safe.mean(2)
+
+
+cases = pytest.mark.parametrize(
+    ("propagation", "reduction", "common"),
+    list(itertools.product(["ts1", "tsinf"], ["max", "mean"], [True, False])),
+)
+
+
+@cases
+def test_rollout_imagination_follows_the_definition(propagation, reduction, common):
+    env, value, safe_set = modules(propagation)
+    latent, actions, noise = problem(common=common, fixed=propagation == "tsinf")
+    imagine = RolloutImagination(env, value, safe_set, constraint_reduction=reduction)
+    expected = particle_by_particle(env, value, safe_set, latent, actions, noise, reduction)
+    for name, got, want in zip(imagine(latent, actions, noise)._fields, imagine(latent, actions, noise), expected, strict=True):
+        torch.testing.assert_close(got, want, atol=1e-5, rtol=1e-4, msg=name)
+
+
+@cases
+def test_the_fused_engine_gives_the_same_statistics(propagation, reduction, common):
+    env, value, safe_set = modules(propagation)
+    latent, actions, noise = problem(common=common, fixed=propagation == "tsinf")
+    plain = RolloutImagination(env, value, safe_set, constraint_reduction=reduction)(latent, actions, noise)
+    fused = FusedImagination(env, value, safe_set, constraint_reduction=reduction, precision="fp32")
+    for name, got, want in zip(plain._fields, fused(latent, actions, noise), plain, strict=True):
+        torch.testing.assert_close(got, want, atol=1e-4, rtol=1e-4, msg=name)
+
+
+def test_reductions_and_noise_make_a_difference():
+    # Otherwise the comparisons above would show little.
+    env, value, safe_set = modules()
+    latent, actions, noise = problem(common=False)
+    largest, mean = (
+        RolloutImagination(env, value, safe_set, constraint_reduction=r)(latent, actions, noise).constraint_prob
+        for r in ("max", "mean")
+    )
+    assert (largest > mean + 0.01).any()
+    assert (largest >= mean).all()
+    other = ImaginationNoise((noise.members + 1) % M, noise.noise)
+    imagine = RolloutImagination(env, value, safe_set)
+    assert not torch.allclose(imagine(latent, actions, noise).value, imagine(latent, actions, other).value, atol=1e-3)
+
+
+def test_under_common_noise_equal_plans_are_judged_equally():
+    env, value, safe_set = modules()
+    latent, actions, noise = problem(common=True)
+    same = actions[:, :1].expand(-1, N, -1, -1)
+    for field in RolloutImagination(env, value, safe_set)(latent, same, noise):
+        torch.testing.assert_close(field, field[:, :1].expand_as(field))
+
+
+def test_imagining_leaves_no_gradients_and_draws_nothing():
+    env, value, safe_set = modules()
+    latent, actions, noise = problem()
+    before = torch.get_rng_state()
+    statistics = RolloutImagination(env, value, safe_set)(latent, actions, noise)
+    assert not any(field.requires_grad for field in statistics)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_members_split_the_particles_evenly_and_anew_at_each_step():
+    torch.manual_seed(0)
+    members = draw_members(5, 200, 20, fixed=False, device=torch.device("cpu"))
+    assert members.shape == (200, 20)
+    assert all(torch.bincount(step, minlength=5).tolist() == [4] * 5 for step in members)
+    # Each particle meets each member: 200 steps, 40 expected, deviation 5.7.
+    met = torch.stack([torch.bincount(path, minlength=5) for path in members.T])
+    assert (met - 40).abs().max() < 5 * 5.7
+
+
+def test_an_uneven_split_differs_by_one_and_favours_nobody():
+    torch.manual_seed(0)
+    members = draw_members(3, 600, 4, fixed=False, device=torch.device("cpu"))
+    counts = torch.stack([torch.bincount(step, minlength=3) for step in members])
+    assert counts.min() == 1
+    assert counts.max() == 2
+    # The member that gets the odd particle: 200 of 600 each, deviation 11.5.
+    assert ((counts == 2).sum(0) - 200).abs().max() < 5 * 11.5
+
+
+def test_fixed_members_stay_over_the_horizon():
+    members = draw_members(3, 4, 7, fixed=True, device=torch.device("cpu"))
+    assert members.shape == (4, 7)
+    assert (members == members[0]).all()

@@ -1,0 +1,75 @@
+import torch
+
+from ls3_torchrl.planners import PlanStatistics, feasible, least_harm, objective
+
+
+def statistics(value=((0.0,),), goal=((0.0,),), constraint=((0.0,),), safe=(1.0,)):
+    return PlanStatistics(*(torch.tensor(field) for field in (value, goal, constraint, safe)))
+
+
+def test_objective_is_the_mean_value_plus_the_steps_in_the_goal():
+    plans = statistics(
+        value=[[-10.0, -20.0], [1.0, 3.0], [0.0, 0.0]],
+        # One half is not yet "in the goal".
+        goal=[[0.4, 0.6, 0.9], [0.5, 0.5, 0.51], [0.0, 0.0, 0.0]],
+    )
+    assert objective(plans).tolist() == [-13.0, 3.0, 0.0]
+
+
+def test_counting_goal_steps_equals_summing_rewards_up_to_the_horizon():
+    torch.manual_seed(0)
+    goal = torch.rand(50, 4)
+    plans = PlanStatistics(torch.zeros(50, 2), goal, torch.zeros(50, 4), torch.ones(50))
+    rewards = torch.where(goal > 0.5, 0.0, -1.0).sum(-1)
+    assert torch.equal(objective(plans) - 4, rewards)
+
+
+def test_pessimism_subtracts_standard_deviations_over_members():
+    # Members 1 and 5: mean 3, population deviation 2. Members that agree lose nothing.
+    plans = statistics(value=[[1.0, 5.0], [2.5, 2.5]])
+    assert objective(plans, pessimism=0.5).tolist() == [2.0, 2.5]
+    assert objective(plans, pessimism=0.0).tolist() == [3.0, 2.5]
+
+
+def test_pessimism_is_finite_for_a_single_member():
+    assert objective(statistics(value=[[4.0]]), pessimism=1.0).tolist() == [4.0]
+
+
+def test_feasible_asks_every_step_and_the_end_both_bounds_included():
+    plans = statistics(
+        constraint=[[0.25, 0.0], [0.0, 0.26], [0.0, 0.0], [0.0, 0.0], [0.9, 0.9]],
+        safe=[0.75, 1.0, 0.75, 0.74, 0.0],
+    )
+    allowed = feasible(plans, safe_set_threshold=0.75, constraint_threshold=0.25)
+    assert allowed.tolist() == [True, False, True, False, False]
+
+
+def test_each_row_may_have_its_own_safe_set_threshold():
+    plans = PlanStatistics(
+        torch.zeros(2, 3, 1), torch.zeros(2, 3, 1), torch.zeros(2, 3, 1), torch.tensor([[0.5, 0.6, 0.7]] * 2)
+    )
+    allowed = feasible(plans, safe_set_threshold=torch.tensor([[0.6], [0.65]]), constraint_threshold=0.2)
+    assert allowed.tolist() == [[False, True, True], [False, False, True]]
+
+
+def test_probabilities_that_are_not_a_number_are_never_feasible():
+    plans = statistics(constraint=[[torch.nan], [0.0]], safe=[1.0, torch.nan])
+    assert not feasible(plans, safe_set_threshold=0.5, constraint_threshold=0.5).any()
+
+
+def test_least_harm_counts_violations_first_and_the_safe_end_second():
+    plans = statistics(
+        # Violating steps: 2, 1, 1, 0, 0; the least safe end with fewer violations beats the safest with more.
+        constraint=[[0.9, 0.9], [0.9, 0.1], [0.1, 0.3], [0.2, 0.2], [0.0, 0.0]],
+        safe=[1.0, 0.0, 0.4, 0.0, 0.1],
+    )
+    ranking = least_harm(plans, constraint_threshold=0.2)
+    assert ranking.argsort(descending=True).tolist() == [4, 3, 2, 1, 0]
+
+
+def test_least_harm_is_lexicographic_for_any_probabilities():
+    torch.manual_seed(0)
+    constraint, safe = torch.rand(300, 5), torch.rand(300)
+    ranking = least_harm(PlanStatistics(torch.zeros(300, 1), constraint, constraint, safe), constraint_threshold=0.3)
+    keys = list(zip((-(constraint > 0.3).sum(-1)).tolist(), safe.tolist(), strict=True))
+    assert ranking.argsort(descending=True).tolist() == sorted(range(300), key=keys.__getitem__, reverse=True)
