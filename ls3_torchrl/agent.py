@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -157,20 +158,28 @@ class LS3Agent(nn.Module):
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"There is no agent at {path}.")
-        content = torch.load(path, map_location=device, weights_only=True)
+        advice = f"{path} is not an agent file ({FORMAT}), or is damaged. Pass a file written by LS3Agent.save()."
+        try:
+            content = torch.load(path, map_location="cpu", weights_only=True)
+        except (EOFError, RuntimeError, pickle.UnpicklingError) as error:
+            raise ValueError(advice) from error
         if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ValueError(f"{path} is not an agent file ({FORMAT}). Pass a file written by LS3Agent.save().")
-        if content["version"] != VERSION:
+            raise ValueError(advice)
+        if content.get("version") != VERSION:
             raise ValueError(
-                f"{path} has version {content['version']}, but this library reads version {VERSION}. "
+                f"{path} has version {content.get('version')}, but this library reads version {VERSION}. "
                 "Train again, or install the library version that wrote it."
             )
         architecture = content["architecture"]
+        # Configurations have lists where the file has tuples.
+        wanted = {
+            name: tuple(v) if isinstance(v, Sequence) and not isinstance(v, str) else v for name, v in expected.items()
+        }
         differing = {
-            name: (architecture.get(name), value) for name, value in expected.items() if architecture.get(name) != value
+            name: (architecture.get(name), value) for name, value in wanted.items() if architecture.get(name) != value
         }
         if differing:
-            words = ", ".join(f"{name} {there} instead of {wanted}" for name, (there, wanted) in differing.items())
+            words = ", ".join(f"{name} {there} instead of {other}" for name, (there, other) in differing.items())
             raise ValueError(f"{path} holds an agent of another shape: {words}. Choose a matching checkpoint.")
         agent = cls(**architecture).to(device)
         try:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import hydra
-from common import console, episode_figures, summarise
 from omegaconf import DictConfig
-from rollout import collect_demonstrations
 
+from common import console, episode_figures, summarise
 from ls3_torchrl.data import save_episodes
+from rollout import collect_demonstrations
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="collect")

@@ -101,6 +101,11 @@ def progress(total: int, what: str, unit: str = "step") -> tqdm:
     )
 
 
+def tick(bar: tqdm) -> None:
+    """Advance a bar from a forward hook, whose return value would replace the module's output."""
+    bar.update()
+
+
 @contextmanager
 def timed(seconds: dict[str, float], phase: str) -> Iterator[None]:
     """Add the block's wall-clock seconds to ``seconds[phase]``."""

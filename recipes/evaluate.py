@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import hydra
-import pictures
 import torch
-from common import RunFolder, choose_device, episode_figures, hardware, print_summary, summarise
 from omegaconf import DictConfig, OmegaConf
-from rollout import make_env, run_episodes
 
+import pictures
+from common import RunFolder, choose_device, episode_figures, hardware, print_summary, summarise
 from ls3_torchrl import LS3Agent
+from rollout import make_env, run_episodes
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
@@ -24,11 +24,13 @@ def main(config: DictConfig) -> None:
     trained = OmegaConf.load(folder / "config.yaml")
     assert isinstance(trained, DictConfig)
     planner_options = OmegaConf.merge(trained.planner, config.planner)
+    assert isinstance(planner_options, DictConfig)
     torch.manual_seed(config.seed)
     action_spec = make_env(trained, 1, config.seed, device).action_spec
     agent = LS3Agent.load(folder / config.agent, device=device, action_dim=action_spec.shape[-1])
-    planner = agent.planner(action_spec, **planner_options)
-    run = RunFolder(config.output, OmegaConf.merge(config, {"planner": planner_options}))
+    planner = agent.planner(action_spec, **{str(key): value for key, value in planner_options.items()})
+    config.planner = planner_options
+    run = RunFolder(config.output, config)
     episodes = run_episodes(trained, planner, config.episodes, config.seed, device, what="Evaluation")
     summary = {
         "task": trained.task.name,

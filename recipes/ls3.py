@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import hydra
-import pictures
 import torch
+from omegaconf import DictConfig
+from torchrl.collectors import Collector
+
+import pictures
 from common import (
     RunFolder,
     choose_device,
@@ -14,16 +17,14 @@ from common import (
     print_summary,
     progress,
     summarise,
+    tick,
     timed,
 )
-from omegaconf import DictConfig
-from rollout import collect_demonstrations, make_env, run_episodes
-from torchrl.collectors import Collector
-from training import Training
-
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer, load_episodes, save_episodes
 from ls3_torchrl.planners import describe_plan
+from rollout import collect_demonstrations, make_env, run_episodes
+from training import Training
 
 
 def seeds(seed: int) -> dict[str, int]:
@@ -88,7 +89,7 @@ def train(config: DictConfig) -> dict:
     online, tracks = [], []
     updates = config.online.updates
     bar = progress(horizon * max(updates, 1), "Planning", "step")
-    ticking = planner.register_forward_hook(lambda *_: bar.update())
+    ticking = planner.register_forward_hook(lambda *_: tick(bar))
     if updates > 0:
         collector = Collector(
             env,

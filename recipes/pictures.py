@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 
 mpl.use("Agg")
 
-import ls3_envs
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from common import read_metrics
 from matplotlib.axes import Axes
 from omegaconf import DictConfig
 from PIL import Image, ImageDraw
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+import ls3_envs
+from common import read_metrics
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag
 from ls3_torchrl.planners import LS3Planner
 
 INK, SAFE, UNSAFE, PALE = "#22303c", "#1b7f79", "#d1495b", "#b8c4cc"
-STYLE = {
+STYLE: Any = {
     "figure.dpi": 130,
     "savefig.bbox": "tight",
     "font.size": 9,
@@ -110,6 +111,7 @@ def learning_curves(folder: Path) -> None:
     plt.close(figure)
 
 
+@torch.no_grad()
 def reconstructions(folder: Path, agent: LS3Agent, offline: dict[Tag, TensorDictBase], columns: int = 12) -> None:
     """Images above what the VAE makes of them, drawn from all data."""
     frames = torch.cat([episodes["pixels"][:, ::7].flatten(0, 1) for episodes in offline.values()])
@@ -149,6 +151,7 @@ def _wall(axis: Axes, extent: tuple[float, float, float, float]) -> None:
     axis.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[], aspect="equal")
 
 
+@torch.no_grad()
 def maps(
     folder: Path,
     env: ls3_envs.VisualConstraintEnv,
@@ -223,6 +226,7 @@ def paths(
     plt.close(figure)
 
 
+@torch.no_grad()
 def plans(
     folder: Path,
     env: ls3_envs.VisualConstraintEnv,

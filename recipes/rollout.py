@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import ls3_envs
 import torch
-from common import progress
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import InitTracker, TransformedEnv
 
+import ls3_envs
+from common import progress, tick
 from ls3_torchrl.data import Tag
 from ls3_torchrl.planners import LS3Planner
 
@@ -47,7 +47,7 @@ def run_episodes(
     env.append_transform(planner.primer())
     horizon = env.base_env.horizon
     with progress(horizon, what) as bar, torch.no_grad():
-        ticking = planner.register_forward_hook(lambda *_: bar.update())
+        ticking = planner.register_forward_hook(lambda *_: tick(bar))
         out = env.rollout(horizon, planner, break_when_any_done=False)
         ticking.remove()
     return out.cpu()

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from common import RunFolder, progress
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torchrl.objectives import HardUpdate, LossModule
 
+from common import RunFolder, progress
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import ALL_TAGS, VALUE_TAGS, TaggedReplayBuffer, random_resized_crop
 from ls3_torchrl.objectives import (
@@ -48,14 +48,17 @@ class Learner:
         self.name, self.loss, self.sample = name, loss, sample
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True)
-        # HardUpdate copies at calls k + 1, 2(k + 1), …: one less than the interval that is meant.
-        self.target = (
-            None if target_interval is None else HardUpdate(loss, value_network_update_interval=target_interval - 1)
-        )
+        self.target_interval = target_interval
+        self.target: HardUpdate | None = None
         self.steps = 0
 
     def train(self, steps: int, what: str, run: RunFolder) -> None:
         """Take ``steps`` gradient steps."""
+        if self.target_interval is not None and self.target is None:
+            # Made at the first step, not before: it copies the network to its target, and another learner may have
+            # trained that network meanwhile (reward-to-go before TD-1). It copies again at calls k + 1, 2(k + 1), …,
+            # so k is one less than the interval that is meant.
+            self.target = HardUpdate(self.loss, value_network_update_interval=self.target_interval - 1)
         with progress(steps, what) as bar:
             for i in range(steps):
                 losses = self.loss(self.sample())

@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
+from torch.func import functional_call
 
 
-def evaluate(network: TensorDictModuleBase, latent: Tensor, **options: bool) -> Tensor:
+def evaluate(
+    network: TensorDictModuleBase, latent: Tensor, *, params: TensorDictParams | None = None, **options: bool
+) -> Tensor:
     """The first output of a module of one latent, whatever its keys are called.
 
     Args:
         network: a module with one in-key; its first out-key is returned.
         latent: ``[*B, D]``.
+        params: weights to use instead of the module's own.
         options: passed on to the module.
     """
     entry = TensorDict({network.in_keys[0]: latent}, batch_size=latent.shape[:1])
-    return network(entry, **options).get(network.out_keys[0])
+    if params is None:
+        return network(entry, **options).get(network.out_keys[0])
+    # Not params.to_module(): it leaves the lagged copies behind as parameters that ask for gradients.
+    weights = {key if isinstance(key, str) else ".".join(key): value for key, value in params.items(True, True)}
+    return functional_call(network, weights, (entry,), options).get(network.out_keys[0])
 
 
 def check_members(latent: Tensor, num_members: int, who: str) -> None:

@@ -84,8 +84,8 @@ class SafeSetLoss(LossModule):
 
     def target(self, next_latent: Tensor, in_success: Tensor) -> Tensor:
         """max(1_S(z_t), γ_S f_S'(z_{t+1})), a probability ``[B, 1]``."""
-        with torch.no_grad(), self.target_safe_set_params.to_module(self.safe_set):
-            next_safe = evaluate(self.safe_set, next_latent).sigmoid()
+        with torch.no_grad():
+            next_safe = evaluate(self.safe_set, next_latent, params=self.target_safe_set_params).sigmoid()
         return torch.maximum(in_success.to(next_safe), self.gamma * next_safe)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -93,6 +93,5 @@ class SafeSetLoss(LossModule):
         keys = self.tensor_keys
         require_keys(tensordict, self.in_keys, "SafeSetLoss")
         target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.in_success))
-        with self.safe_set_params.to_module(self.safe_set):
-            logit = evaluate(self.safe_set, tensordict.get(keys.latent))
+        logit = evaluate(self.safe_set, tensordict.get(keys.latent), params=self.safe_set_params)
         return as_scalars(loss_safe_set=binary_cross_entropy_with_logits(logit, target))

@@ -175,8 +175,8 @@ class TD1ValueLoss(LossModule):
 
     def target(self, next_latent: Tensor, reward: Tensor) -> Tensor:
         """r_t + γ V_θ'(z_{t+1}) of every member, ``[B, M, 1]``."""
-        with torch.no_grad(), self.target_value_params.to_module(self.value):
-            next_value = evaluate(self.value, next_latent, per_member=self.bootstrap)
+        with torch.no_grad():
+            next_value = evaluate(self.value, next_latent, params=self.target_value_params, per_member=self.bootstrap)
         reward = reward if self.bootstrap else reward.unsqueeze(-2)
         reward = reward.expand_as(next_value)
         never = torch.zeros_like(reward, dtype=torch.bool)
@@ -191,6 +191,5 @@ class TD1ValueLoss(LossModule):
         if self.bootstrap:
             check_members(latent, self.num_members, "TD1ValueLoss")
         target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.reward))
-        with self.value_params.to_module(self.value):
-            value = evaluate(self.value, latent, per_member=self.bootstrap)
+        value = evaluate(self.value, latent, params=self.value_params, per_member=self.bootstrap)
         return as_scalars(loss_value=(value - target).square().mean())

@@ -29,7 +29,7 @@ class Evaluate(Protocol):
     """Judges candidate sequences."""
 
     def __call__(self, actions: Tensor, rows: Tensor, restarts: Tensor, population: int) -> Judgement:
-        """Judge ``actions`` ``[b, N, H, A]`` of the batch rows ``rows`` ``[b]``, restarted ``restarts`` ``[b]`` times."""
+        """Judge ``actions`` ``[b, N, H, A]`` of batch rows ``rows`` ``[b]``, restarted ``restarts`` ``[b]`` times."""
 
 
 #: Draws the noise of one population: (rows ``[b]``, population) -> standard normal and uniform in [0, 1), each

@@ -174,7 +174,7 @@ def test_latents_are_drawn_anew_from_the_posterior_at_each_use():
         assert (noise.std() - 1).abs() < 0.03
     here, there = ((group["latent"] - group["loc"]).flatten() for group in (batch, batch["next"]))
     assert torch.corrcoef(torch.stack([here, there]))[0, 1].abs() < 0.04
-    assert "latent" not in buffer.latents.storage[:].keys()  # drawn, never stored
+    assert "latent" not in set(buffer.latents.storage[:].keys())  # drawn, never stored
 
 
 def test_members_get_batches_of_their_own():
@@ -264,7 +264,9 @@ def test_an_episode_longer_than_the_buffer_is_refused(sizes):
         TaggedReplayBuffer(latent_dim=D, **sizes).add(Film().shoot(4), "success")
 
 
-@pytest.mark.parametrize("sizes", [{"capacity": 0}, {"capacity": 5, "pixel_capacity": 1}, {"capacity": 5, "latent_dim": 0}])
+@pytest.mark.parametrize(
+    "sizes", [{"capacity": 0}, {"capacity": 5, "pixel_capacity": 1}, {"capacity": 5, "latent_dim": 0}]
+)
 def test_impossible_sizes_are_refused(sizes):
     with pytest.raises(ValueError, match="must be at least"):
         TaggedReplayBuffer(**sizes)
@@ -273,7 +275,7 @@ def test_impossible_sizes_are_refused(sizes):
 def test_an_encoder_of_another_size_is_refused():
     buffer = TaggedReplayBuffer(20, latent_dim=D)
     buffer.add(Film().shoot(2), "success")
-    with pytest.raises(ValueError, match="latents of size 6.*latent_dim=4"):
+    with pytest.raises(ValueError, match=r"latents of size 6.*latent_dim=4"):
         buffer.encode(PixelEncoder(latent_dim=6))
 
 

@@ -39,9 +39,7 @@ def test_rows_are_the_indices_of_the_tags():
 
 @pytest.mark.parametrize("tags", [[], [0, 0, 3]])
 def test_a_tag_without_rows_says_which_and_what_to_do(tags):
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(8), sampler=TagSampler(["constraint", "rand"])
-    )
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8), sampler=TagSampler(["constraint", "rand"]))
     if tags:
         buffer.extend(rows(tags))
     with pytest.raises(RuntimeError, match=rf"{len(tags)} rows.*'rand', 'constraint'.*Collect"):
@@ -83,8 +81,6 @@ def test_relabelled_rows_are_seen_after_refresh():
 
 
 def test_nested_tag_key():
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(8), sampler=TagSampler(["rand"], tag_key=("meta", "tag"))
-    )
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8), sampler=TagSampler(["rand"], tag_key=("meta", "tag")))
     buffer.extend(TensorDict({"meta": {"tag": torch.tensor([[0], [1]], dtype=torch.uint8)}}, [2]))
     assert buffer.sample(3)["meta", "tag"].flatten().tolist() == [1, 1, 1]

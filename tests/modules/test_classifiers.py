@@ -26,9 +26,7 @@ def test_default_network_is_three_layers_of_256(kind: type[LatentClassifier], lo
 
 
 @each_classifier
-def test_only_the_logit_is_written_unless_the_probability_is_asked_for(
-    kind: type[LatentClassifier], logit_key: str
-):
+def test_only_the_logit_is_written_unless_the_probability_is_asked_for(kind: type[LatentClassifier], logit_key: str):
     latent = torch.randn(4, 8)
     td = kind(8, hidden=(16,))(TensorDict({"latent": latent}, [4]))
     assert set(td.keys()) == {"latent", logit_key}
@@ -63,9 +61,7 @@ def test_any_batch_shape(kind: type[LatentClassifier], logit_key: str, batch: tu
 
 @each_classifier
 def test_nested_keys(kind: type[LatentClassifier], logit_key: str):
-    classifier = kind(
-        8, hidden=(16,), latent_key=("model", "z"), logit_key=("judge", "logit"), prob_key=("judge", "p")
-    )
+    classifier = kind(8, hidden=(16,), latent_key=("model", "z"), logit_key=("judge", "logit"), prob_key=("judge", "p"))
     td = classifier(TensorDict({"model": {"z": torch.randn(4, 8)}}, [4]))
     torch.testing.assert_close(td["judge", "p"], td["judge", "logit"].sigmoid())
     assert logit_key not in td

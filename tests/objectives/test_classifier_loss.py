@@ -26,12 +26,12 @@ def reached(latent: list[float], label: list[bool], name: str = "constraint") ->
 
 
 def test_loss_and_accuracy_by_hand():
-    z, violated = [1.0, -0.5, 2.0, -3.0], [True, True, False, False]
+    z, violated = [0.1, -0.5, 2.0, -3.0], [True, True, False, False]
     out = ClassifierLoss(linear_estimator(2.0))(reached(z, violated))
     probability = [1 / (1 + math.exp(-2 * a)) for a in z]
     terms = [math.log(p if y else 1 - p) for p, y in zip(probability, violated, strict=True)]
     assert out["loss_constraint"].item() == pytest.approx(-sum(terms) / 4, rel=1e-5)
-    # Logits 2, -1, 4, -6 say yes, no, yes, no: the second and third are wrong.
+    # Logits 0.2, -1, 4, -6 say yes, no, yes, no: the second and third are wrong.
     assert out["constraint_accuracy"].item() == 0.5
     assert out["loss_constraint"].requires_grad
     assert not out["constraint_accuracy"].requires_grad
@@ -73,6 +73,14 @@ def test_misspelt_and_missing_keys():
         loss.set_keys(labels=("next", "success"))
     with pytest.raises(KeyError, match=r"ClassifierLoss needs the keys \[\('next', 'constraint'\)\]"):
         loss(reached([0.0], [True], name="success"))
+
+
+def test_loss_names_its_keys():
+    loss = ClassifierLoss(linear_estimator(1.0), name="goal")
+    loss.set_keys(label=("next", "success"))
+    assert loss.in_keys == [("next", "latent"), ("next", "success")]
+    assert loss.out_keys == ["loss_goal", "goal_accuracy"]
+    assert "loss_goal" in repr(loss)
 
 
 @pytest.mark.parametrize("kind", [ConstraintEstimator, GoalEstimator])

@@ -136,3 +136,19 @@ def test_predicted_scale_settles_at_the_spread_of_the_data(minimise):
     loc, scale = dynamics.distribution(torch.zeros(1, 1), torch.zeros(1, 1))
     assert loc.item() == pytest.approx(0.0, abs=0.02)
     assert scale.item() == pytest.approx(0.5, rel=0.03)
+
+
+def test_loss_names_its_keys():
+    loss = EnsembleDynamicsLoss(constant_dynamics())
+    loss.set_keys(action=("agent", "a"))
+    assert loss.in_keys == ["latent", ("agent", "a"), ("next", "latent")]
+    assert loss.out_keys == ["loss_dynamics", "prediction_error"]
+    assert "loss_dynamics" in repr(loss)
+
+
+def test_loss_compiles_in_one_graph():
+    loss = EnsembleDynamicsLoss(EnsembleDynamics(4, 2, hidden=(8,)))
+    batch = TensorDict({"latent": torch.randn(6, 4), "action": torch.randn(6, 2)}, [6])
+    batch["next"] = {"latent": torch.randn(6, 4)}
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(batch)["loss_dynamics"], loss(batch)["loss_dynamics"])

@@ -21,6 +21,13 @@ def linear_safe_set(slope: float) -> SafeSet:
     return safe_set
 
 
+def lagged_loss(safe_set: SafeSet, **options: object) -> SafeSetLoss:
+    """The loss with the updater that it asks for; its target copies the safe set as it is now."""
+    loss = SafeSetLoss(safe_set, **options)
+    HardUpdate(loss, value_network_update_interval=99)
+    return loss
+
+
 def sigmoid(x: float) -> float:
     return 1 / (1 + math.exp(-x))
 
@@ -42,7 +49,7 @@ def transitions(latent: list[float], next_latent: list[float], in_success: list[
 
 def test_target_and_loss_by_hand():
     z, z_next, in_success = [0.3, -1.0, 2.0, 0.0], [1.0, 2.0, -3.0, 0.5], [True, False, False, True]
-    loss = SafeSetLoss(linear_safe_set(2.0), gamma=0.3)
+    loss = lagged_loss(linear_safe_set(2.0), gamma=0.3)
     targets = [max(float(s), 0.3 * sigmoid(2 * b)) for b, s in zip(z_next, in_success, strict=True)]
     batch = transitions(z, z_next, in_success)
     made = loss.target(batch["next", "latent"], batch["in_success"])
@@ -54,7 +61,7 @@ def test_target_and_loss_by_hand():
 
 
 def test_float_labels_are_as_good_as_booleans():
-    loss = SafeSetLoss(linear_safe_set(2.0))
+    loss = lagged_loss(linear_safe_set(2.0))
     batch = transitions([0.3, -1.0], [1.0, 2.0], [True, False])
     as_bool = loss(batch)["loss_safe_set"]
     batch["in_success"] = batch["in_success"].float()
@@ -63,7 +70,7 @@ def test_float_labels_are_as_good_as_booleans():
 
 def test_target_uses_the_lagged_weights_and_carries_no_gradient():
     safe_set = linear_safe_set(2.0)
-    loss = SafeSetLoss(safe_set, gamma=0.5)
+    loss = lagged_loss(safe_set, gamma=0.5)
     with torch.no_grad():
         safe_set.network.weight.fill_(-1.0)
     out = loss(transitions([0.7], [1.5], [False]))["loss_safe_set"]
@@ -74,10 +81,12 @@ def test_target_uses_the_lagged_weights_and_carries_no_gradient():
     out.backward()
     assert safe_set.network.weight.grad.item() == pytest.approx((probability - target) * 0.7, rel=1e-5)
     assert not any(p.requires_grad for p in loss.target_safe_set_params.values(True, True))
+    # So a second updater, for online training after offline, can be built on a loss that has been used.
+    HardUpdate(loss, value_network_update_interval=99)
 
 
 def test_without_discounted_successors_the_target_is_the_indicator():
-    loss = SafeSetLoss(linear_safe_set(2.0), gamma=0.0)
+    loss = lagged_loss(linear_safe_set(2.0), gamma=0.0)
     made = loss.target(torch.tensor([[5.0], [5.0]]), torch.tensor([[True], [False]]))
     assert made.flatten().tolist() == [1.0, 0.0]
 
@@ -93,6 +102,23 @@ def test_target_is_copied_at_updates_100_and_200_and_at_no_other():
         updater.step()
         lagged.append(loss.target_safe_set_params["network", "weight"].item())
     assert lagged == [0.0] * 99 + [100.0] * 100 + [200.0] * 51
+
+
+def test_training_leaves_the_target_where_the_last_copy_put_it():
+    safe_set = linear_safe_set(0.5)
+    loss = SafeSetLoss(safe_set)
+    updater = HardUpdate(loss, value_network_update_interval=2)
+    optimiser = torch.optim.SGD(loss.parameters(), 0.5)
+    batch = transitions([1.0, -2.0], [0.5, 1.0], [True, False])
+    history = [0.5]
+    for update in range(1, 8):
+        loss(batch)["loss_safe_set"].backward()
+        optimiser.step()
+        optimiser.zero_grad()
+        history.append(safe_set.network.weight.item())
+        assert history[-1] != history[-2]
+        updater.step()
+        assert loss.target_safe_set_params["network", "weight"].item() == history[update // 3 * 3]
 
 
 def test_fixed_point_iteration_spreads_safety_backwards_over_a_chain(minimise):
@@ -120,7 +146,7 @@ def test_fixed_point_iteration_spreads_safety_backwards_over_a_chain(minimise):
 
 def test_nested_keys_of_loss_and_module():
     safe_set = SafeSet(3, hidden=(8,), latent_key=("m", "z"), logit_key=("m", "logit"))
-    loss = SafeSetLoss(safe_set)
+    loss = lagged_loss(safe_set)
     z, z_next, label = torch.randn(5, 3), torch.randn(5, 3), torch.rand(5, 1) > 0.5
     flat = loss(TensorDict({"latent": z, "in_success": label, "next": {"latent": z_next}}, [5]))
     loss.set_keys(latent=("now", "z"), next_latent=("later", "z"), in_success=("labels", "safe"))
@@ -129,7 +155,7 @@ def test_nested_keys_of_loss_and_module():
 
 
 def test_misspelt_and_missing_keys():
-    loss = SafeSetLoss(linear_safe_set(1.0))
+    loss = lagged_loss(linear_safe_set(1.0))
     with pytest.raises(ValueError, match="in_succes is not an accepted tensordict key"):
         loss.set_keys(in_succes="safe")
     batch = transitions([0.0], [1.0], [True])
@@ -155,6 +181,22 @@ def test_safe_set_overfits_eight_states(minimise):
     )
     safe_set = SafeSet(4, prob_key="safe_set_prob")
     # γ_S = 0 leaves plain labels, so that the loss can fall to zero.
-    first, last = minimise(SafeSetLoss(safe_set, gamma=0.0), batch, "loss_safe_set", steps=80, lr=1e-3)
+    first, last = minimise(lagged_loss(safe_set, gamma=0.0), batch, "loss_safe_set", steps=80, lr=1e-3)
     assert last < 0.1 * first
     assert torch.equal(safe_set(batch)["safe_set_prob"] > 0.5, in_success)
+
+
+def test_loss_names_its_keys():
+    loss = lagged_loss(linear_safe_set(1.0))
+    loss.set_keys(in_success="safe")
+    assert loss.in_keys == ["latent", ("next", "latent"), "safe"]
+    assert loss.out_keys == ["loss_safe_set"]
+    assert "loss_safe_set" in repr(loss)
+
+
+def test_loss_compiles_in_one_graph():
+    loss = lagged_loss(SafeSet(4, hidden=(8,)))
+    batch = TensorDict({"latent": torch.randn(6, 4), "in_success": torch.tensor([[True], [False]] * 3)}, [6])
+    batch["next"] = {"latent": torch.randn(6, 4)}
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(batch)["loss_safe_set"], loss(batch)["loss_safe_set"])

@@ -177,6 +177,15 @@ def test_misspelt_and_missing_keys():
         loss(TensorDict({"pixels": greys(0.5)}, [1]))
 
 
+def test_loss_names_its_keys():
+    loss = constant_vae(0.25)
+    assert loss.in_keys == ["pixels"]
+    loss.set_keys(target=("clean", "pixels"))
+    assert loss.in_keys == ["pixels", ("clean", "pixels")]
+    assert loss.out_keys == ["loss_vae", "reconstruction", "kl"]
+    assert "loss_vae" in repr(loss)
+
+
 def test_bad_options_are_refused():
     with pytest.raises(ValueError, match="beta must not be negative"):
         constant_vae(0.25, beta=-1e-6)

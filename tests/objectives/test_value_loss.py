@@ -1,5 +1,7 @@
 """Equations (3) and (4) restated by hand on small chains."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -16,6 +18,13 @@ def linear_value(*slopes: float) -> ValueEnsemble:
         value.network.weights[0].copy_(torch.tensor(slopes).view(-1, 1, 1))
         value.network.biases[0].zero_()
     return value
+
+
+def td1_loss(value: ValueEnsemble, **options: object) -> TD1ValueLoss:
+    """The loss with the updater that it asks for; its target copies the value as it is now."""
+    loss = TD1ValueLoss(value, **options)
+    HardUpdate(loss, value_network_update_interval=99)
+    return loss
 
 
 def tabular_value(values: list[float]) -> ValueEnsemble:
@@ -71,7 +80,7 @@ def test_exact_values_of_equation_3_solve_equation_4_too():
     offline = TensorDict({"latent": states, "reward_to_go": column(values)}, [4])
     value = tabular_value(values)
     assert OfflineValueLoss(value)(offline)["loss_value"].item() == pytest.approx(0.0, abs=1e-10)
-    assert TD1ValueLoss(value, gamma=gamma)(td1)["loss_value"].item() == pytest.approx(0.0, abs=1e-10)
+    assert td1_loss(value, gamma=gamma)(td1)["loss_value"].item() == pytest.approx(0.0, abs=1e-10)
     assert values[0] == pytest.approx(-1 - 0.9 - 0.81)
 
 
@@ -80,7 +89,7 @@ def test_exact_values_of_equation_3_solve_equation_4_too():
 
 def test_td1_loss_by_hand_every_member_bootstraps_from_itself():
     slopes, z, z_next = (1.0, -2.0), [0.5, 3.0], [1.5, 2.0]
-    loss = TD1ValueLoss(linear_value(*slopes), gamma=0.5)
+    loss = td1_loss(linear_value(*slopes), gamma=0.5)
     targets = [[-1 + 0.5 * s * b for s in slopes] for b in z_next]
     made = loss.target(column(z_next), column([-1.0, -1.0]))
     assert made.shape == (2, 2, 1)
@@ -99,13 +108,13 @@ def test_td1_bootstrap_column_m_teaches_member_m():
         for m in range(2):
             target = 0.0 if rewards[i][m] == 0 else rewards[i][m] + 0.5 * slopes[m] * z_next[i][m]
             cells.append((slopes[m] * z[i][m] - target) ** 2)
-    loss = TD1ValueLoss(linear_value(*slopes), gamma=0.5, bootstrap=True)
+    loss = td1_loss(linear_value(*slopes), gamma=0.5, bootstrap=True)
     assert loss(steps(z, z_next, rewards))["loss_value"].item() == pytest.approx(sum(cells) / 4)
 
 
 def test_target_uses_the_lagged_weights():
     value = linear_value(2.0)
-    loss = TD1ValueLoss(value, gamma=0.5)
+    loss = td1_loss(value, gamma=0.5)
     with torch.no_grad():
         value.network.weights[0].fill_(7.0)
     # V(z) has the new slope 7, the target still the old slope 2.
@@ -115,24 +124,24 @@ def test_target_uses_the_lagged_weights():
 
 def test_target_carries_no_gradient():
     value = linear_value(2.0)
-    loss = TD1ValueLoss(value, gamma=0.5)
-    loss(steps([1.0], [3.0], [-1.0]))["loss_value"].backward()
-    # Only V(z_t) is differentiated: 2 (2·1 - (-1 + 0.5·2·3)) · 1 = 0, so take another state to see a slope.
-    assert value.network.weights[0].grad.item() == pytest.approx(0.0)
+    loss = td1_loss(value, gamma=0.5)
     loss(steps([2.0], [3.0], [-1.0]))["loss_value"].backward()
+    # V(z_t) alone is differentiated: 2 (w z - target) z with w z = 4 and target = -1 + 0.5·2·3 = 2.
     assert value.network.weights[0].grad.item() == pytest.approx(2 * (4.0 - 2.0) * 2.0)
     assert not any(p.requires_grad for p in loss.target_value_params.values(True, True))
+    # So a second updater, for online training after offline, can be built on a loss that has been used.
+    HardUpdate(loss, value_network_update_interval=99)
 
 
 @pytest.mark.parametrize(("zero_at_goal", "target"), [(True, 0.0), (False, 0.0 + 0.5 * 2.0 * 3.0)])
 def test_the_target_in_the_goal_is_zero_or_the_bootstrap(zero_at_goal: bool, target: float):
-    loss = TD1ValueLoss(linear_value(2.0), gamma=0.5, zero_at_goal=zero_at_goal)
+    loss = td1_loss(linear_value(2.0), gamma=0.5, zero_at_goal=zero_at_goal)
     made = loss.target(column([3.0, 3.0]), column([0.0, -1.0]))
     assert made.flatten().tolist() == [target, -1 + 0.5 * 2.0 * 3.0]
 
 
 def test_the_end_of_an_episode_does_not_mask_the_bootstrap():
-    loss = TD1ValueLoss(linear_value(2.0), gamma=0.5)
+    loss = td1_loss(linear_value(2.0), gamma=0.5)
     batch = steps([1.0, 4.0], [3.0, 5.0], [-1.0, -1.0])
     ended = torch.ones(2, 1, dtype=torch.bool)
     batch["next"].update({"done": ended, "terminated": ended, "truncated": ended})
@@ -153,8 +162,28 @@ def test_target_is_copied_at_updates_100_and_200_and_at_no_other():
     assert lagged == [0.0] * 99 + [100.0] * 100 + [200.0] * 51
 
 
+def test_training_leaves_the_target_where_the_last_copy_put_it():
+    torch.manual_seed(1)
+    value = ValueEnsemble(2, num_members=2, hidden=(8,))
+    loss = TD1ValueLoss(value, gamma=0.5)
+    updater = HardUpdate(loss, value_network_update_interval=2)
+    optimiser = torch.optim.Adam(loss.parameters(), 0.05)
+    batch = TensorDict({"latent": torch.randn(6, 2)}, [6])
+    batch["next"] = {"latent": torch.randn(6, 2), "reward": -torch.ones(6, 1)}
+    history = [value.network.weights[0].detach().clone()]
+    for update in range(1, 8):
+        loss(batch)["loss_value"].backward()
+        optimiser.step()
+        optimiser.zero_grad()
+        history.append(value.network.weights[0].detach().clone())
+        assert not torch.equal(history[-1], history[-2])
+        updater.step()
+        lagged = loss.target_value_params["network", "weights", "0"]
+        assert torch.equal(lagged, history[update // 3 * 3])
+
+
 def test_default_discount_is_table_1s():
-    loss = TD1ValueLoss(linear_value(1.0))
+    loss = td1_loss(linear_value(1.0))
     assert (loss.gamma, loss.zero_at_goal) == (0.99, True)
 
 
@@ -163,7 +192,7 @@ def test_default_discount_is_table_1s():
 
 def test_nested_keys_of_losses_and_module():
     value = ValueEnsemble(3, hidden=(8,), latent_key=("m", "z"), value_key=("m", "v"))
-    offline, td1 = OfflineValueLoss(value), TD1ValueLoss(value)
+    offline, td1 = OfflineValueLoss(value), td1_loss(value)
     z, z_next, g = torch.randn(5, 3), torch.randn(5, 3), torch.randn(5, 1)
     flat = TensorDict({"latent": z, "reward_to_go": g, "next": {"latent": z_next, "reward": g}}, [5])
     nested = TensorDict({"now": {"z": z, "g": g}, "later": {"z": z_next}}, [5])
@@ -174,20 +203,20 @@ def test_nested_keys_of_losses_and_module():
     assert torch.equal(td1(nested)["loss_value"], plain[1])
 
 
-@pytest.mark.parametrize("kind", [OfflineValueLoss, TD1ValueLoss])
-def test_misspelt_and_missing_keys(kind: type):
-    loss = kind(linear_value(1.0))
+@pytest.mark.parametrize("make", [OfflineValueLoss, td1_loss])
+def test_misspelt_and_missing_keys(make: Callable):
+    loss = make(linear_value(1.0))
     with pytest.raises(ValueError, match="rewards is not an accepted tensordict key"):
         loss.set_keys(rewards="r")
-    missing = "reward_to_go" if kind is OfflineValueLoss else r"\('next', 'reward'\)"
+    missing = "reward_to_go" if make is OfflineValueLoss else r"\('next', 'reward'\)"
     batch = TensorDict({"latent": torch.zeros(2, 1), "next": {"latent": torch.zeros(2, 1)}}, [2])
-    with pytest.raises(KeyError, match=rf"{kind.__name__} needs the keys .*{missing}"):
+    with pytest.raises(KeyError, match=rf"{type(loss).__name__} needs the keys .*{missing}"):
         loss(batch)
 
 
-@pytest.mark.parametrize("kind", [OfflineValueLoss, TD1ValueLoss])
-def test_a_bootstrap_batch_needs_one_column_per_member(kind: type):
-    loss = kind(linear_value(1.0, 2.0), bootstrap=True)
+@pytest.mark.parametrize("make", [OfflineValueLoss, td1_loss])
+def test_a_bootstrap_batch_needs_one_column_per_member(make: Callable):
+    loss = make(linear_value(1.0, 2.0), bootstrap=True)
     batch = steps([1.0, 2.0], [1.0, 2.0], [-1.0, -1.0])
     batch["reward_to_go"] = batch["next", "reward"]
     with pytest.raises(ValueError, match=r"latents of shape \[B, 2, D\]"):
@@ -221,3 +250,20 @@ def test_td1_finds_the_values_of_a_chain(minimise):
     minimise(loss, batch, "loss_value", steps=300, lr=5e-2, updater=updater)
     learnt = value(TensorDict({"latent": states}, [4]))["state_value"].flatten()
     torch.testing.assert_close(learnt, torch.tensor([-1.75, -1.5, -1.0, 0.0]), atol=0.03, rtol=0)
+
+
+def test_losses_name_their_keys():
+    offline, td1 = OfflineValueLoss(linear_value(1.0)), td1_loss(linear_value(1.0))
+    td1.set_keys(reward="r")
+    assert offline.in_keys == ["latent", "reward_to_go"]
+    assert td1.in_keys == ["latent", ("next", "latent"), "r"]
+    assert offline.out_keys == td1.out_keys == ["loss_value"]
+    assert "loss_value" in repr(td1)
+
+
+def test_td1_loss_compiles_in_one_graph():
+    loss = td1_loss(ValueEnsemble(4, hidden=(8,)))
+    batch = TensorDict({"latent": torch.randn(6, 4)}, [6])
+    batch["next"] = {"latent": torch.randn(6, 4), "reward": column([-1.0, 0.0] * 3)}
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(batch)["loss_value"], loss(batch)["loss_value"])

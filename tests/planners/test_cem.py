@@ -297,6 +297,20 @@ def test_every_population_is_scored_and_the_result_is_one_of_them():
         assert (seen == result.actions[row]).all(-1).all(-1).any()
 
 
+def test_the_best_of_all_rounds_is_kept_not_of_the_last():
+    torch.manual_seed(0)
+
+    def ever_worse(actions, rows, restarts, population):
+        score = actions[..., 0].sum(-1) - 100.0 * population
+        return Judgement(score, torch.ones_like(score, dtype=torch.bool), score)
+
+    record = Record(ever_worse)
+    result = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3)(record, LOW, HIGH, batch=1, horizon=2)
+    actions, *_, judgement = record.asked[0]
+    assert torch.equal(result.actions[0], actions[0, judgement.score[0].argmax()])
+    assert result.score[0] == judgement.score.max()
+
+
 def test_finished_rows_are_not_judged_any_more():
     torch.manual_seed(0)
 

@@ -61,7 +61,9 @@ def test_rollout_imagination_follows_the_definition(propagation, reduction, comm
     latent, actions, noise = problem(common=common, fixed=propagation == "tsinf")
     imagine = RolloutImagination(env, value, safe_set, constraint_reduction=reduction)
     expected = particle_by_particle(env, value, safe_set, latent, actions, noise, reduction)
-    for name, got, want in zip(imagine(latent, actions, noise)._fields, imagine(latent, actions, noise), expected, strict=True):
+    for name, got, want in zip(
+        imagine(latent, actions, noise)._fields, imagine(latent, actions, noise), expected, strict=True
+    ):
         torch.testing.assert_close(got, want, atol=1e-5, rtol=1e-4, msg=name)
 
 

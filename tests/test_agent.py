@@ -1,0 +1,188 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded
+
+from ls3_torchrl import LS3Agent
+from ls3_torchrl.planners import LS3Planner
+
+TINY = {
+    "latent_dim": 4,
+    "num_dynamics": 2,
+    "num_values": 3,
+    "dynamics_hidden": (8,),
+    "value_hidden": (8, 8),
+    "classifier_hidden": (8,),
+}
+NETWORKS = ("encoder", "decoder", "dynamics", "value", "safe_set", "constraint", "goal")
+
+
+def tiny(seed=0, **options):
+    torch.manual_seed(seed)
+    return LS3Agent(2, **(TINY | options))
+
+
+def outputs(agent):
+    """What all seven networks say of the same images and latents."""
+    generator = torch.Generator().manual_seed(5)
+    pixels = torch.randint(256, (3, 3, 64, 64), dtype=torch.uint8, generator=generator)
+    td = TensorDict({"pixels": pixels, "action": torch.randn(3, 2, generator=generator)}, [3])
+    td["dynamics_member"] = torch.tensor([[0], [1], [0]])
+    td["dynamics_noise"] = torch.randn(3, 4, generator=generator)
+    with torch.no_grad():
+        for name in NETWORKS:
+            getattr(agent, name)(td)
+    return td
+
+
+def change(path, **entries):
+    """Rewrite entries of an agent file."""
+    torch.save(torch.load(path, weights_only=True) | entries, path)
+
+
+def test_default_sizes_are_the_papers():
+    agent = LS3Agent(2)
+    layers = [tuple(weight.shape) for weight in agent.value.network.weights]
+    assert layers == [(5, 32, 256), (5, 256, 256), (5, 256, 256), (5, 256, 1)]
+    layers = [tuple(weight.shape) for weight in agent.dynamics.network.weights]
+    assert layers == [(5, 34, 128), (5, 128, 128), (5, 128, 64)]
+    for head in (agent.safe_set, agent.constraint, agent.goal):
+        shapes = [tuple(p.shape) for p in head.parameters() if p.ndim == 2]
+        assert shapes == [(256, 32), (256, 256), (256, 256), (1, 256)]
+    assert agent.dynamics.propagation == "ts1"
+
+
+def test_a_round_trip_gives_identical_outputs(tmp_path):
+    agent = tiny()
+    path = agent.save(tmp_path / "deep" / "folder" / "agent.pt")
+    loaded = LS3Agent.load(path)
+    assert loaded.architecture == agent.architecture
+    one, two = outputs(agent), outputs(loaded)
+    keys = one.keys(True, True)
+    assert {("next", "latent"), "state_value", "goal_logit", "reco_pixels", "loc"} <= set(keys)
+    for key in keys:
+        assert torch.equal(one[key], two[key]), key
+    assert not torch.equal(one["loc"], outputs(tiny(seed=1))["loc"])
+    # No half-written file stays behind.
+    assert [file.name for file in path.parent.iterdir()] == ["agent.pt"]
+
+
+def test_propagation_travels_with_the_file(tmp_path):
+    assert LS3Agent.load(tiny(propagation="tsinf").save(tmp_path / "a.pt")).dynamics.propagation == "tsinf"
+
+
+def test_saving_again_replaces_the_file(tmp_path):
+    tiny(0).save(tmp_path / "agent.pt")
+    other = tiny(1)
+    other.save(tmp_path / "agent.pt")
+    assert torch.equal(outputs(LS3Agent.load(tmp_path / "agent.pt"))["loc"], outputs(other)["loc"])
+
+
+def test_expected_sizes_that_agree_are_no_matter(tmp_path):
+    path = tiny().save(tmp_path / "agent.pt")
+    LS3Agent.load(path, action_dim=2, latent_dim=4, value_hidden=(8, 8))
+    # Configuration files have lists where the constructor keeps tuples.
+    LS3Agent.load(path, value_hidden=[8, 8])
+
+
+@pytest.mark.parametrize(
+    ("expected", "message"),
+    [
+        ({"action_dim": 3}, "action_dim 2 instead of 3"),
+        ({"latent_dim": 32, "in_channels": 9}, "latent_dim 4 instead of 32, in_channels 3 instead of 9"),
+        ({"value_hidden": [8, 9]}, r"value_hidden \(8, 8\) instead of"),
+    ],
+)
+def test_another_shape_than_expected_is_refused(tmp_path, expected, message):
+    path = tiny().save(tmp_path / "agent.pt")
+    with pytest.raises(ValueError, match=f"another shape: {message}"):
+        LS3Agent.load(path, **expected)
+
+
+def test_another_version_is_refused(tmp_path):
+    path = tiny().save(tmp_path / "agent.pt")
+    change(path, version=99)
+    with pytest.raises(ValueError, match="has version 99, but this library reads version 1"):
+        LS3Agent.load(path)
+
+
+@pytest.mark.parametrize("content", [{"format": "other"}, {"state_dict": {}}, [1, 2]])
+def test_files_that_are_no_agents_are_refused(tmp_path, content):
+    torch.save(content, tmp_path / "agent.pt")
+    with pytest.raises(ValueError, match=r"is not an agent file.*LS3Agent\.save"):
+        LS3Agent.load(tmp_path / "agent.pt")
+
+
+@pytest.mark.parametrize("keep", [0, 10, 2000, -100])
+def test_truncated_files_are_refused(tmp_path, keep):
+    path = tiny().save(tmp_path / "agent.pt")
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(ValueError, match="is not an agent file"):
+        LS3Agent.load(path)
+
+
+def test_text_files_are_refused(tmp_path):
+    (tmp_path / "agent.pt").write_text("not weights at all\n")
+    with pytest.raises(ValueError, match="is not an agent file"):
+        LS3Agent.load(tmp_path / "agent.pt")
+
+
+def test_weights_that_do_not_fit_are_refused(tmp_path):
+    path = tiny().save(tmp_path / "agent.pt")
+    change(path, state_dict=tiny(value_hidden=(9,)).state_dict())
+    with pytest.raises(ValueError, match="does not fit its own architecture"):
+        LS3Agent.load(path)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no agent at .*agent\.pt"):
+        LS3Agent.load(tmp_path / "agent.pt")
+
+
+@pytest.mark.parametrize("size", ["action_dim", "in_channels", "latent_dim", "num_dynamics", "num_values"])
+def test_sizes_below_one_are_refused(size):
+    with pytest.raises(ValueError, match="must be at least 1, got 0"):
+        LS3Agent(**({"action_dim": 2} | TINY | {size: 0}))
+
+
+def test_unknown_propagation_is_refused():
+    with pytest.raises(ValueError, match="propagation must be one of 'ts1', 'tsinf'"):
+        tiny(propagation="ts2")
+
+
+OPTIONS = {"num_candidates": 20, "num_elites": 4, "num_particles": 2, "optim_steps": 1, "horizon": 2}
+
+
+@pytest.mark.parametrize("worlds", [[], [5], [2, 3]])
+def test_a_planner_takes_a_batched_environments_action_spec(worlds):
+    low, high = torch.tensor([-1.0, 0.5]), torch.tensor([0.0, 2.0])
+    spec = Bounded(low=low.expand(*worlds, 2), high=high.expand(*worlds, 2), shape=(*worlds, 2))
+    planner = tiny().planner(spec, **OPTIONS)
+    assert isinstance(planner, LS3Planner)
+    assert planner.action_spec.shape == (2,)
+    assert torch.equal(planner.action_spec.space.low, low)
+    assert torch.equal(planner.action_spec.space.high, high)
+    pixels = torch.randint(256, (*worlds, 3, 64, 64), dtype=torch.uint8)
+    action = planner(TensorDict({"pixels": pixels}, worlds))["action"]
+    assert action.shape == (*worlds, 2)
+    assert ((action >= low) & (action <= high)).all()
+
+
+def test_a_planner_plans_with_the_agents_own_networks():
+    agent = tiny()
+    planner = agent.planner(Bounded(low=-1.0, high=1.0, shape=(2,)), **OPTIONS)
+    assert planner.env.dynamics is agent.dynamics
+    assert planner.env.constraint is agent.constraint
+    assert planner.env.goal is agent.goal
+    assert planner.value is agent.value
+    assert planner.safe_set is agent.safe_set
+    assert planner.encoder is agent.encoder
+
+
+def test_options_of_the_planner_are_passed_on():
+    spec = Bounded(low=-1.0, high=1.0, shape=(2,))
+    planner = tiny().planner(spec, **(OPTIONS | {"horizon": 7, "safe_set_threshold": 0.5}))
+    assert planner.horizon == 7
+    assert planner.safe_set_threshold == 0.5
+    with pytest.raises(TypeError, match="depth"):
+        tiny().planner(spec, depth=3)
