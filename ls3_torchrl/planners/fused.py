@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +23,10 @@ from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics
 Precision = Literal["auto", "fp32", "bf16"]
 #: A network's layers: weight ``[out, in]`` and bias ``[out]``, ReLU between them.
 Layers = list[tuple[Tensor, Tensor]]
+#: Candidates under which a part is not worth a core of its own.
+_SMALLEST_PART = 400
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 
 
 def _is_relu_mlp(network: nn.Module) -> bool:
@@ -97,12 +102,32 @@ def fastest_precision(device_type: str) -> Literal["fp32", "bf16"]:
     return "bf16" if seconds[torch.bfloat16] < 0.67 * seconds[torch.float32] else "fp32"
 
 
+def _take_one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+@lru_cache(maxsize=2)
+def _pool(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers, thread_name_prefix="imagination", initializer=_take_one_thread)
+
+
+def _side_by_side(job: Callable[[Job], Result], items: Sequence[Job], workers: int) -> list[Result]:
+    """Results of ``job`` on each item: whole items on each core, since layers this small gain nothing from sharing."""
+    if workers < 2 or len(items) < 2:
+        return [job(item) for item in items]
+    torch.set_num_threads(1)
+    try:
+        return list(_pool(workers).map(job, items))
+    finally:
+        torch.set_num_threads(workers)
+
+
 class FusedImagination:
     """The same statistics as :class:`~ls3_torchrl.planners.RolloutImagination`, many times faster.
 
-    It works on a snapshot of the weights, taken anew whenever a parameter has changed since. Particles are
-    carried one after another over blocks of candidates: memory grows with N alone. Latents stay float32; the
-    layers run in ``precision``.
+    It works on a snapshot of the weights, taken anew whenever a parameter has changed since. Blocks
+    of candidates are spread over the cores, their particles carried in groups: memory grows with N alone. Latents
+    stay float32; the layers run in ``precision``.
 
     Args:
         env: the learned model; its networks must be those of :mod:`ls3_torchrl.modules`.
@@ -138,7 +163,7 @@ class FusedImagination:
         self.precision = precision
         self.block = block
         self._seen: list[Tensor] = []
-        self._dynamics: list[Layers] = []
+        self._dynamics: Layers = []  # stacked over members: weights [M, in, out], biases [M, 1, out]
         self._value: list[Layers] = []
         self._heads: dict[str, Layers] = {}
 
@@ -162,7 +187,11 @@ class FusedImagination:
         device = parameters[0].device
         chosen = fastest_precision(device.type) if self.precision == "auto" else self.precision
         self._dtype = torch.bfloat16 if chosen == "bf16" else torch.float32
-        self._dynamics = _members_of(self.env.dynamics.network, self._dtype)
+        network = self.env.dynamics.network
+        self._dynamics = [
+            (weight.detach().to(self._dtype).clone(), bias.detach().to(self._dtype).clone())
+            for weight, bias in zip(network.weights, network.biases, strict=True)
+        ]
         self._value = _members_of(self.value.network, self._dtype)
         self._heads = {
             name: _layers_of(head.network, self._dtype)
@@ -180,39 +209,52 @@ class FusedImagination:
         """Statistics of ``actions`` ``[b, N, H, A]`` carried out from ``latent`` ``[b, D]``."""
         self.refresh()
         b, n, horizon, _ = actions.shape
-        particles = noise.members.shape[1]
-        members = noise.members.tolist()
-        value = latent.new_zeros(b, n, len(self._value))
-        goal = latent.new_zeros(b, n, horizon)
-        constraint = latent.new_zeros(b, n, horizon)
-        safe = latent.new_zeros(b, n)
-        for row in range(b):
-            for start in range(0, n, self.block):
-                part = slice(start, min(start + self.block, n))
-                plan = actions[row, part].transpose(0, 1).contiguous()  # [H, R, A]
-                shared = noise.noise.shape[3] == 1
-                step_noise = noise.noise[row] if shared else noise.noise[row, :, :, part]
-                group = max(1, self.block // plan.shape[1])
-                for first in range(0, particles, group):
-                    chosen = range(first, min(first + group, particles))
-                    states = torch.stack(
-                        [self._carry(latent[row], plan, [m[p] for m in members], step_noise[:, p]) for p in chosen]
-                    )  # [G, H, R, D]
-                    in_goal = self._probability("goal", states)
-                    violating = self._probability("constraint", states)
-                    goal[row, part] += in_goal.sum(0).T
-                    if self.constraint_reduction == "max":
-                        worst = torch.maximum(constraint[row, part], violating.amax(0).T)
-                        constraint[row, part] = worst
-                    else:
-                        constraint[row, part] += violating.sum(0).T
-                    end = states[:, -1]
-                    safe[row, part] += self._probability("safe_set", end).sum(0)
-                    flat = end.reshape(-1, end.shape[-1])
-                    for m, layers in enumerate(self._value):
-                        value[row, part, m] += run_layers(flat, layers).float().reshape(len(chosen), -1).sum(0)
-        if self.constraint_reduction == "mean":
-            constraint /= particles
+        workers = torch.get_num_threads() if latent.device.type == "cpu" else 1
+        # Parts depend on N and the number of workers alone: a row's plan is the same, bit for bit, in any batch.
+        size = min(self.block, max(-(-n // workers), _SMALLEST_PART))
+        parts = [(row, slice(start, min(start + size, n))) for row in range(b) for start in range(0, n, size)]
+
+        def judge(job: tuple[int, slice]) -> PlanStatistics:
+            row, part = job
+            shared = noise.noise.shape[3] == 1
+            step_noise = noise.noise[row] if shared else noise.noise[row, :, :, part]
+            plan = actions[row, part].transpose(0, 1).contiguous()
+            return self._judge(latent[row], plan, noise.members, step_noise)
+
+        out = PlanStatistics(
+            value=latent.new_empty(b, n, len(self._value)),
+            goal_prob=latent.new_empty(b, n, horizon),
+            constraint_prob=latent.new_empty(b, n, horizon),
+            safe_set_prob=latent.new_empty(b, n),
+        )
+        for (row, part), found in zip(parts, _side_by_side(judge, parts, workers), strict=True):
+            for whole, piece in zip(out, found, strict=True):
+                whole[row, part] = piece
+        return out
+
+    @torch.no_grad()
+    def _judge(self, latent: Tensor, plan: Tensor, members: Tensor, noise: Tensor) -> PlanStatistics:
+        """Statistics of the plans ``[H, R, A]`` from one latent ``[D]`` under noise ``[H, P, R or 1, D]``."""
+        horizon, r, _ = plan.shape
+        particles = noise.shape[1]
+        value = latent.new_zeros(r, len(self._value))
+        goal, constraint = latent.new_zeros(r, horizon), latent.new_zeros(r, horizon)
+        safe = latent.new_zeros(r)
+        group = max(1, self.block // r)
+        for first in range(0, particles, group):
+            chosen = slice(first, min(first + group, particles))
+            states = self._carry(latent, plan, members[:, chosen], noise[:, chosen])
+            goal += self._probability("goal", states).sum(0).T
+            violating = self._probability("constraint", states)
+            if self.constraint_reduction == "max":
+                constraint = torch.maximum(constraint, violating.amax(0).T)
+            else:
+                constraint += violating.sum(0).T / particles
+            end = states[:, -1]
+            safe += self._probability("safe_set", end).sum(0)
+            flat = end.reshape(-1, end.shape[-1])
+            for m, layers in enumerate(self._value):
+                value[:, m] += run_layers(flat, layers).float().reshape(-1, r).sum(0)
         return PlanStatistics(value / particles, goal / particles, constraint, safe / particles)
 
     def _probability(self, head: str, states: Tensor) -> Tensor:
@@ -220,14 +262,23 @@ class FusedImagination:
         logit = run_layers(states.reshape(-1, states.shape[-1]), self._heads[head])
         return logit.float().sigmoid().reshape(states.shape[:-1])
 
-    def _carry(self, latent: Tensor, plan: Tensor, members: list[int], noise: Tensor) -> Tensor:
-        """One particle of every plan ``[H, R, A]``: the latents ``[H, R, D]`` it visits, in layer precision."""
+    def _carry(self, latent: Tensor, plan: Tensor, members: Tensor, noise: Tensor) -> Tensor:
+        """G particles of every plan ``[H, R, A]``: the latents ``[G, H, R, D]`` they visit, in layer precision.
+
+        Members ``[H, G]`` pick the weights that move each particle; noise is ``[H, G, R or 1, D]``.
+        """
         low, high = self.env.dynamics.log_scale_bounds
-        state = latent.expand(plan.shape[1], -1)
+        particles, rows = members.shape[1], plan.shape[1]
+        state = latent.expand(particles, rows, -1)
+        last = len(self._dynamics) - 1
         path = []
         for action, member, step_noise in zip(plan, members, noise, strict=True):
-            inputs = torch.cat([state, action], -1).to(self._dtype)
-            delta, log_scale = run_layers(inputs, self._dynamics[member]).float().chunk(2, -1)
+            x = torch.cat([state, action.expand(particles, -1, -1)], -1).to(self._dtype)
+            for i, (weight, bias) in enumerate(self._dynamics):
+                x = torch.baddbmm(bias[member], x, weight[member])
+                if i < last:
+                    x = x.relu_()
+            delta, log_scale = x.float().chunk(2, -1)
             state = torch.addcmul(state + delta, log_scale.clamp(low, high).exp(), step_noise.expand_as(delta))
             path.append(state.to(self._dtype))
-        return torch.stack(path)
+        return torch.stack(path, 1)
