@@ -97,7 +97,7 @@ def progress(total: int, what: str, unit: str = "step") -> tqdm:
         mininterval=0.2 if _INTERACTIVE else 20.0,
         dynamic_ncols=_INTERACTIVE,
         leave=True,
-        bar_format="{desc} {percentage:3.0f}%|{bar:24}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]",
+        bar_format="{desc} {percentage:3.0f}%|{bar:24}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]",  # noqa: E501
     )
 
 

@@ -121,7 +121,7 @@ def reconstructions(folder: Path, agent: LS3Agent, offline: dict[Tag, TensorDict
     figure, axes = plt.subplots(2, columns, figsize=(columns, 2.2))
     for column in range(columns):
         for row, (images, name) in enumerate(((frames, "input"), (made, "VAE"))):
-            axes[row, column].imshow(images[column, :3].permute(1, 2, 0))
+            axes[row, column].imshow(images[column, :3].permute(1, 2, 0).numpy())
             axes[row, column].set_axis_off()
             if column == 0:
                 axes[row, 0].set_title(name, loc="left")
@@ -141,6 +141,11 @@ def _encode_states(env: ls3_envs.VisualConstraintEnv, agent: LS3Agent, states: T
         for part in states.split(512)
     ]
     return torch.cat(parts)
+
+
+def _line(track: Tensor) -> np.ndarray:
+    """Positions ``[T, 2]`` as the x and y that matplotlib draws."""
+    return track.detach().cpu().numpy().T
 
 
 def _wall(axis: Axes, extent: tuple[float, float, float, float]) -> None:
@@ -185,11 +190,11 @@ def maps(
         low, high = limits or (picture.min(), picture.max())
         image = axis.imshow(picture, extent=extent, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
         if level is not None and picture.min() < level < picture.max():
-            axis.contour(grid[..., 0], grid[..., 1], picture, levels=[level], colors=INK, linewidths=0.8)
+            axis.contour(grid[..., 0].numpy(), grid[..., 1].numpy(), picture, levels=[level], colors=INK, linewidths=0.8)
         for tag, colour in ((Tag.SUCCESS, SAFE), (Tag.CONSTRAINT, UNSAFE)):
             if tag in offline:
                 for track in offline[tag]["state"][:8]:
-                    axis.plot(track[:, 0], track[:, 1], color=colour, lw=0.5, alpha=0.6)
+                    axis.plot(*_line(track), color=colour, lw=0.5, alpha=0.6)
         _wall(axis, extent)
         axis.set_title(title)
         figure.colorbar(image, ax=axis, shrink=0.7, pad=0.02)
@@ -214,14 +219,14 @@ def paths(
         _wall(axis, extent)
         axis.set_title(title)
     for track in offline[Tag.SUCCESS]["state"][:20]:
-        axes[0].plot(*track.T, color=SAFE, lw=0.6, alpha=0.6)
+        axes[0].plot(*_line(track), color=SAFE, lw=0.6, alpha=0.6)
     colours = plt.get_cmap("viridis")(np.linspace(0.9, 0.1, max(len(tracks), 1)))
     for colour, update in zip(colours, tracks, strict=False):
         for track in update:
-            axes[1].plot(*track.T, color=colour, lw=0.7, alpha=0.7)
+            axes[1].plot(*_line(track), color=colour, lw=0.7, alpha=0.7)
     violated = evaluation["next", "constraint"].any(1).flatten()
     for track, bad in zip(evaluation["state"], violated, strict=True):
-        axes[2].plot(*track.T, color=UNSAFE if bad else SAFE, lw=0.8, alpha=0.7)
+        axes[2].plot(*_line(track), color=UNSAFE if bad else SAFE, lw=0.8, alpha=0.7)
     figure.savefig(folder / "paths.png")
     plt.close(figure)
 
@@ -259,9 +264,9 @@ def plans(
         chosen = planner.plan(latent).actions
         for action, allowed in zip(actions[0].cpu(), verdict.feasible[0].cpu(), strict=True):
             track = torch.cat([state[None], state + action.cumsum(0)])
-            axis.plot(*track.T, color=SAFE if allowed else UNSAFE, lw=0.5, alpha=0.45)
+            axis.plot(*_line(track), color=SAFE if allowed else UNSAFE, lw=0.5, alpha=0.45)
         track = torch.cat([state[None], state + chosen[0].cpu().cumsum(0)])
-        axis.plot(*track.T, color=INK, lw=2.2)
+        axis.plot(*_line(track), color=INK, lw=2.2)
         _wall(axis, extent)
         centre = state.tolist()
         axis.set(xlim=(centre[0] - 35, centre[0] + 35), ylim=(centre[1] + 30, centre[1] - 30))

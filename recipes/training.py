@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -23,6 +24,17 @@ from ls3_torchrl.objectives import (
 )
 
 LOG_EVERY = 100
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Compute on one core: networks of this size lose more by waking a second than they gain by it."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 class Learner:
@@ -59,7 +71,7 @@ class Learner:
             # trained that network meanwhile (reward-to-go before TD-1). It copies again at calls k + 1, 2(k + 1), …,
             # so k is one less than the interval that is meant.
             self.target = HardUpdate(self.loss, value_network_update_interval=self.target_interval - 1)
-        with progress(steps, what) as bar:
+        with one_thread(), progress(steps, what) as bar:
             for i in range(steps):
                 losses = self.loss(self.sample())
                 value = losses[f"loss_{self.name}"]

@@ -71,7 +71,8 @@ class NavigationViolator(_Scripted):
     Use it with ``NavigationEnv(start="random")``.
 
     Args:
-        noise_std: standard deviation of the action noise in window units.
+        noise_std: standard deviation of the action noise in window units, the demonstrator's own by default. The
+            supplement names none; without it each episode shows the dynamics two actions only.
         seed: seed of directions and noise.
 
     Example:
@@ -83,7 +84,7 @@ class NavigationViolator(_Scripted):
         True
     """
 
-    def __init__(self, *, noise_std: float = 0.0, seed: int = 0) -> None:
+    def __init__(self, *, noise_std: float = 2 * MAX_STEP / 5, seed: int = 0) -> None:
         super().__init__(noise_std=noise_std, seed=seed)
         self._direction: Tensor | None = None
 
