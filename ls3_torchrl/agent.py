@@ -42,6 +42,7 @@ class AgentArchitecture:
     dynamics_hidden: tuple[int, ...] = (128, 128)
     value_hidden: tuple[int, ...] = (256, 256, 256)
     classifier_hidden: tuple[int, ...] = (256, 256, 256)
+    initial_value: float = 0.0
     propagation: Literal["ts1", "tsinf"] = "ts1"
 
 
@@ -57,6 +58,7 @@ class LS3Agent(nn.Module):
         dynamics_hidden: hidden layers of f_dyn.
         value_hidden: hidden layers of V.
         classifier_hidden: hidden layers of f_S, f_C and f_G.
+        initial_value: where the value networks' output biases start.
         propagation: ``"ts1"`` or ``"tsinf"``.
 
     Raises:
@@ -85,6 +87,7 @@ class LS3Agent(nn.Module):
         dynamics_hidden: Sequence[int] = (128, 128),
         value_hidden: Sequence[int] = (256, 256, 256),
         classifier_hidden: Sequence[int] = (256, 256, 256),
+        initial_value: float = 0.0,
         propagation: Literal["ts1", "tsinf"] = "ts1",
     ) -> None:
         super().__init__()
@@ -103,6 +106,7 @@ class LS3Agent(nn.Module):
             dynamics_hidden=tuple(dynamics_hidden),
             value_hidden=tuple(value_hidden),
             classifier_hidden=tuple(classifier_hidden),
+            initial_value=initial_value,
             propagation=propagation,
         )
         self.encoder = PixelEncoder(in_channels, latent_dim)
@@ -110,7 +114,7 @@ class LS3Agent(nn.Module):
         self.dynamics = EnsembleDynamics(
             latent_dim, action_dim, num_members=num_dynamics, hidden=dynamics_hidden, propagation=propagation
         )
-        self.value = ValueEnsemble(latent_dim, num_members=num_values, hidden=value_hidden)
+        self.value = ValueEnsemble(latent_dim, num_members=num_values, hidden=value_hidden, initial_value=initial_value)
         self.safe_set = SafeSet(latent_dim, hidden=classifier_hidden)
         self.constraint = ConstraintEstimator(latent_dim, hidden=classifier_hidden)
         self.goal = GoalEstimator(latent_dim, hidden=classifier_hidden)

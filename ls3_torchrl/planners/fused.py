@@ -18,7 +18,7 @@ from ls3_torchrl.modules.ensemble import EnsembleMLP
 from ls3_torchrl.modules.value import ValueEnsemble
 from ls3_torchrl.planners.imagination import ImaginationNoise
 from ls3_torchrl.planners.latent_env import LatentEnv
-from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics
+from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction
 
 Precision = Literal["auto", "fp32", "bf16"]
 #: A network's layers: weight ``[out, in]`` and bias ``[out]``, ReLU between them.
@@ -134,6 +134,7 @@ class FusedImagination:
         value: V.
         safe_set: f_S.
         constraint_reduction: over particles, ``"max"`` or ``"mean"``.
+        safe_set_reduction: over particles, ``"mean"`` or ``"min"``.
         precision: ``"fp32"``, ``"bf16"``, or ``"auto"`` for what a short measurement finds faster here.
         block: particles of candidates that are carried and judged together.
 
@@ -149,6 +150,7 @@ class FusedImagination:
         safe_set: LatentClassifier,
         *,
         constraint_reduction: ConstraintReduction = "max",
+        safe_set_reduction: SafeSetReduction = "mean",
         precision: Precision = "auto",
         block: int = 1024,
     ) -> None:
@@ -160,6 +162,7 @@ class FusedImagination:
             )
         self.env, self.value, self.safe_set = env, value, safe_set
         self.constraint_reduction = constraint_reduction
+        self.safe_set_reduction = safe_set_reduction
         self.precision = precision
         self.block = block
         self._seen: list[Tensor] = []
@@ -239,7 +242,7 @@ class FusedImagination:
         particles = noise.shape[1]
         value = latent.new_zeros(r, len(self._value))
         goal, constraint = latent.new_zeros(r, horizon), latent.new_zeros(r, horizon)
-        safe = latent.new_zeros(r)
+        safe = latent.new_full((r,), float(self.safe_set_reduction == "min"))
         group = max(1, self.block // r)
         for first in range(0, particles, group):
             chosen = slice(first, min(first + group, particles))
@@ -251,11 +254,15 @@ class FusedImagination:
             else:
                 constraint += violating.sum(0).T / particles
             end = states[:, -1]
-            safe += self._probability("safe_set", end).sum(0)
+            in_safe_set = self._probability("safe_set", end)
+            if self.safe_set_reduction == "min":
+                safe = torch.minimum(safe, in_safe_set.amin(0))
+            else:
+                safe += in_safe_set.sum(0) / particles
             flat = end.reshape(-1, end.shape[-1])
             for m, layers in enumerate(self._value):
                 value[:, m] += run_layers(flat, layers).float().reshape(-1, r).sum(0)
-        return PlanStatistics(value / particles, goal / particles, constraint, safe / particles)
+        return PlanStatistics(value / particles, goal / particles, constraint, safe)
 
     def _probability(self, head: str, states: Tensor) -> Tensor:
         """Probabilities ``[...]`` by a head of latents ``[..., D]``."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from ls3_torchrl.modules.classifiers import LatentClassifier
 from ls3_torchrl.modules.value import ValueEnsemble
 from ls3_torchrl.planners.latent_env import LatentEnv
-from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics
+from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction
 
 
 class ImaginationNoise(NamedTuple):
@@ -52,6 +52,7 @@ class RolloutImagination:
         value: V.
         safe_set: f_S.
         constraint_reduction: over particles, ``"max"`` (the authors') or ``"mean"``.
+        safe_set_reduction: over particles, ``"mean"`` (the authors') or ``"min"``.
 
     Example:
         >>> from torchrl.data import Bounded
@@ -71,9 +72,11 @@ class RolloutImagination:
         safe_set: LatentClassifier,
         *,
         constraint_reduction: ConstraintReduction = "max",
+        safe_set_reduction: SafeSetReduction = "mean",
     ) -> None:
         self.env, self.value, self.safe_set = env, value, safe_set
         self.constraint_reduction = constraint_reduction
+        self.safe_set_reduction = safe_set_reduction
 
     @torch.no_grad()
     def __call__(self, latent: Tensor, actions: Tensor, noise: ImaginationNoise) -> PlanStatistics:
@@ -104,9 +107,10 @@ class RolloutImagination:
         ends = TensorDict({self.value.in_keys[0]: end}, [b, n, p])
         value = self.value(ends).get(self.value.out_keys[0]).squeeze(-1)
         constraint = path["next", "constraint_prob"].squeeze(-1)
+        safe = self.safe_set.probability(end).squeeze(-1)
         return PlanStatistics(
             value=value.mean(2),
             goal_prob=path["next", "goal_prob"].squeeze(-1).mean(2),
             constraint_prob=constraint.amax(2) if self.constraint_reduction == "max" else constraint.mean(2),
-            safe_set_prob=self.safe_set.probability(end).squeeze(-1).mean(2),
+            safe_set_prob=safe.amin(2) if self.safe_set_reduction == "min" else safe.mean(2),
         )

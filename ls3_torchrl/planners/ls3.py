@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -33,6 +33,7 @@ from ls3_torchrl.planners.latent_env import LatentEnv
 from ls3_torchrl.planners.scoring import (
     ConstraintReduction,
     PlanStatistics,
+    SafeSetReduction,
     feasible,
     least_harm,
     objective,
@@ -91,6 +92,9 @@ class LS3Planner(MPCPlannerBase):
         max_relaxations: how often δ_S may be relaxed in one plan.
         p_random: share of uniform candidates in the first round; the rest are drawn round the last plan.
         constraint_reduction: over particles, ``"max"`` as the authors' code or ``"mean"``.
+        safe_set_reduction: over particles, ``"mean"`` as the authors' code or ``"min"``: every particle must end
+            in the safe set. A mean of δ_S lets a share 1 − δ_S of the particles end anywhere, and a plan gains from
+            sending them where the value is overestimated.
         pessimism: κ ≥ 0, subtracts κ standard deviations over the value ensemble; 0 is the paper.
         common_noise: judge all candidates of a row by the same particles (common random numbers), which
             compares them with less variance; ``False`` draws noise for each.
@@ -143,6 +147,7 @@ class LS3Planner(MPCPlannerBase):
         max_relaxations: int = 5,
         p_random: float = 1.0,
         constraint_reduction: ConstraintReduction = "max",
+        safe_set_reduction: SafeSetReduction = "mean",
         pessimism: float = 0.0,
         common_noise: bool = True,
         min_std: float = 0.0,
@@ -160,6 +165,11 @@ class LS3Planner(MPCPlannerBase):
         self.constraint_threshold = require_probability(constraint_threshold, "constraint_threshold")
         self.relaxation = require_probability(relaxation, "relaxation")
         require_choice(constraint_reduction, ("max", "mean"), "constraint_reduction")
+        require_choice(safe_set_reduction, ("mean", "min"), "safe_set_reduction")
+        reductions: dict[str, Any] = {
+            "constraint_reduction": constraint_reduction,
+            "safe_set_reduction": safe_set_reduction,
+        }
         require_choice(engine, ("auto", "fused", "rollout"), "engine")
         if pessimism < 0.0:
             raise ValueError(f"pessimism must not be negative, got {pessimism}.")
@@ -176,11 +186,9 @@ class LS3Planner(MPCPlannerBase):
         self.value, self.safe_set, self.encoder = value, safe_set, encoder
         self.imagine: Imagination
         if engine == "fused" or (engine == "auto" and FusedImagination.supports(env, value, safe_set)):
-            self.imagine = FusedImagination(
-                env, value, safe_set, constraint_reduction=constraint_reduction, precision=precision
-            )
+            self.imagine = FusedImagination(env, value, safe_set, precision=precision, **reductions)
         else:
-            self.imagine = RolloutImagination(env, value, safe_set, constraint_reduction=constraint_reduction)
+            self.imagine = RolloutImagination(env, value, safe_set, **reductions)
         self.action_key, self.latent_key = action_key, latent_key
         self.plan_key, self.is_init_key = plan_key, is_init_key
         self.in_keys = [latent_key] if encoder is None else list(encoder.in_keys)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 ConstraintReduction = Literal["max", "mean"]
+SafeSetReduction = Literal["mean", "min"]
 
 
 class PlanStatistics(NamedTuple):
@@ -17,7 +18,7 @@ class PlanStatistics(NamedTuple):
         value: mean over particles of every member's V(z_H), ``[*B, N, M]``.
         goal_prob: mean probability of the goal at each step, ``[*B, N, H]``.
         constraint_prob: largest (or mean) probability of a violation at each step, ``[*B, N, H]``.
-        safe_set_prob: mean probability that z_H lies in the safe set, ``[*B, N]``.
+        safe_set_prob: mean (or smallest) probability that z_H lies in the safe set, ``[*B, N]``.
     """
 
     value: Tensor

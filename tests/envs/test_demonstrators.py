@@ -51,16 +51,25 @@ def test_all_fifty_violators_violate_and_none_starts_in_the_wall(violations: Ten
     assert (flags.diff(dim=1) >= 0).all()
 
 
-def test_violators_move_in_one_direction_for_15_steps(violations: TensorDictBase):
-    actions = violations["action"][:, :15]
+def test_violators_move_in_one_direction_for_15_steps_and_then_towards_the_wall():
+    env = TransformedEnv(NavigationEnv(num_worlds=50, start="random", seed=0), InitTracker())
+    episodes = collect_episodes(env, NavigationViolator(noise_std=0.0, seed=0))
+    actions = episodes["action"][:, :15]
     assert torch.equal(actions, actions[:, :1].expand_as(actions))
     torch.testing.assert_close(actions[:, 0].norm(dim=-1), torch.full((50,), 3.0))
     assert not torch.equal(actions[0, 0], actions[1, 0])
     # Afterwards at half speed towards the wall's centre.
-    later = violations["action"][:, 15]
-    towards = torch.tensor([87.5, 75.0]) - violations["state"][:, 15]
+    later = episodes["action"][:, 15]
+    towards = torch.tensor([87.5, 75.0]) - episodes["state"][:, 15]
     expected = 1.5 * towards / towards.norm(dim=-1, keepdim=True)
     torch.testing.assert_close(later, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_violators_are_as_noisy_as_the_demonstrator_unless_told_otherwise(violations: TensorDictBase):
+    # The dynamics must see more than two actions an episode.
+    assert NavigationViolator().noise_std == NavigationDemonstrator().noise_std
+    changes = violations["action"][:, 1:15] - violations["action"][:, :14]
+    assert (changes.abs().sum(-1) > 0).float().mean() > 0.9
 
 
 def test_actions_stay_in_the_box(demonstrations: TensorDictBase, violations: TensorDictBase):
