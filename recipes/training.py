@@ -27,14 +27,14 @@ LOG_EVERY = 100
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Compute on one core: networks of this size lose more by waking a second than they gain by it."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+def threads(count: int | None) -> Iterator[None]:
+    """Compute on ``count`` cores; on as many as before when ``None``."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count or before)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(before)
 
 
 class Learner:
@@ -71,7 +71,8 @@ class Learner:
             # trained that network meanwhile (reward-to-go before TD-1). It copies again at calls k + 1, 2(k + 1), …,
             # so k is one less than the interval that is meant.
             self.target = HardUpdate(self.loss, value_network_update_interval=self.target_interval - 1)
-        with one_thread(), progress(steps, what) as bar:
+        # Networks of this size lose more by waking a second core than they gain by it.
+        with threads(1), progress(steps, what) as bar:
             for i in range(steps):
                 losses = self.loss(self.sample())
                 value = losses[f"loss_{self.name}"]
@@ -154,7 +155,7 @@ class Training:
             else torch.optim.lr_scheduler.ConstantLR(optimizer, factor=1.0)
         )
         device = next(agent.parameters()).device
-        with progress(options.steps, "VAE") as bar:
+        with threads(options.threads), progress(options.steps, "VAE") as bar:
             for i in range(options.steps):
                 target = self.buffer.sample_pixels(options.batch_size)["pixels"].to(device)
                 pixels = (

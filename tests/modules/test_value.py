@@ -57,3 +57,13 @@ def test_nested_keys():
 def test_missing_latent_is_named():
     with pytest.raises(KeyError, match=r"ValueEnsemble needs the keys \['latent'\].*It has: z"):
         ValueEnsemble(8, hidden=(16,))(TensorDict({"z": torch.zeros(4, 8)}, [4]))
+
+
+def test_initial_value_shifts_an_untrained_ensemble_and_nothing_else():
+    torch.manual_seed(0)
+    plain = ValueEnsemble(4, num_members=3, hidden=(8,))
+    torch.manual_seed(0)
+    shifted = ValueEnsemble(4, num_members=3, hidden=(8,), initial_value=-100.0)
+    td = TensorDict({"latent": torch.randn(6, 4)}, [6])
+    difference = shifted(td.clone())["state_value"] - plain(td.clone())["state_value"]
+    torch.testing.assert_close(difference, torch.full((6, 3, 1), -100.0))

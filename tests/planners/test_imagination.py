@@ -30,7 +30,7 @@ def problem(*, common=True, fixed=False):
     return 2 * torch.randn(B, D), torch.rand(B, N, H, A) * 2 - 1, noise
 
 
-def particle_by_particle(env, value, safe_set, latent, actions, noise, reduction):
+def particle_by_particle(env, value, safe_set, latent, actions, noise, reduction, safe_reduction="mean"):
     """The definition, one particle of one plan at a time."""
     shapes = [(B, N, P, 2), (B, N, P, H), (B, N, P, H), (B, N, P)]
     values, goals, constraints, safe = (torch.zeros(shape) for shape in shapes)
@@ -46,7 +46,7 @@ def particle_by_particle(env, value, safe_set, latent, actions, noise, reduction
             values[b, n, p] = value.network(z).squeeze(-1)
             safe[b, n, p] = safe_set.probability(z).squeeze()
     constraint = constraints.amax(2) if reduction == "max" else constraints.mean(2)
-    return values.mean(2), goals.mean(2), constraint, safe.mean(2)
+    return values.mean(2), goals.mean(2), constraint, safe.amin(2) if safe_reduction == "min" else safe.mean(2)
 
 
 cases = pytest.mark.parametrize(
@@ -75,6 +75,20 @@ def test_the_fused_engine_gives_the_same_statistics(propagation, reduction, comm
     fused = FusedImagination(env, value, safe_set, constraint_reduction=reduction, precision="fp32")
     for name, got, want in zip(plain._fields, fused(latent, actions, noise), plain, strict=True):
         torch.testing.assert_close(got, want, atol=1e-4, rtol=1e-4, msg=name)
+
+
+@pytest.mark.parametrize("common", [True, False])
+def test_every_particle_must_end_in_the_safe_set_under_min(common):
+    env, value, safe_set = modules()
+    latent, actions, noise = problem(common=common)
+    expected = particle_by_particle(env, value, safe_set, latent, actions, noise, "max", "min")[-1]
+    for engine in (RolloutImagination, FusedImagination):
+        options = {"precision": "fp32"} if engine is FusedImagination else {}
+        imagine = engine(env, value, safe_set, safe_set_reduction="min", **options)
+        got = imagine(latent, actions, noise).safe_set_prob
+        torch.testing.assert_close(got, expected, atol=1e-4, rtol=1e-4)
+    mean = RolloutImagination(env, value, safe_set)(latent, actions, noise).safe_set_prob
+    assert (expected < mean - 1e-3).any()
 
 
 def test_reductions_and_noise_make_a_difference():

@@ -580,6 +580,7 @@ def test_probabilities_must_lie_strictly_between_zero_and_one(name, value):
         ({"engine": "jax"}, "engine must be one of 'auto', 'fused', 'rollout'; got 'jax'"),
         ({"precision": "fp8"}, "precision must be one of 'auto', 'fp32', 'bf16'; got 'fp8'"),
         ({"constraint_reduction": "min"}, "constraint_reduction must be one of 'max', 'mean'; got 'min'"),
+        ({"safe_set_reduction": "max"}, "safe_set_reduction must be one of 'mean', 'min'; got 'max'"),
     ],
 )
 def test_settings_out_of_range_are_refused(wrong, message):
