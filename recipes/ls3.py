@@ -73,6 +73,7 @@ def train(config: DictConfig) -> dict:
             config.task.buffer_capacity,
             latent_dim=config.agent.latent_dim,
             gamma=config.loss.gamma,
+            continue_failures=config.loss.continue_failures,
             device=device,
         )
         for tag, episodes in offline.items():

@@ -190,7 +190,8 @@ def maps(
         low, high = limits or (picture.min(), picture.max())
         image = axis.imshow(picture, extent=extent, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
         if level is not None and picture.min() < level < picture.max():
-            axis.contour(grid[..., 0].numpy(), grid[..., 1].numpy(), picture, levels=[level], colors=INK, linewidths=0.8)
+            x, y = grid.unbind(-1)
+            axis.contour(x.numpy(), y.numpy(), picture, levels=[level], colors=INK, linewidths=0.8)
         for tag, colour in ((Tag.SUCCESS, SAFE), (Tag.CONSTRAINT, UNSAFE)):
             if tag in offline:
                 for track in offline[tag]["state"][:8]:

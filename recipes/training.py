@@ -121,8 +121,15 @@ class Training:
             draw(ALL_TAGS, members),
             lr=optim.dynamics_lr,
         )
+        # The same equation on all offline data: what the values know of places that no success has visited.
+        self.background = Learner(
+            "value", OfflineValueLoss(agent.value, bootstrap=bootstrap), draw(ALL_TAGS, values), lr=optim.lr
+        )
         self.value = Learner(
-            "value", OfflineValueLoss(agent.value, bootstrap=bootstrap), draw(VALUE_TAGS, values), lr=optim.lr
+            "value",
+            OfflineValueLoss(agent.value, bootstrap=bootstrap),
+            draw(VALUE_TAGS, values),
+            lr=optim.lr,
         )
         self.value_td = Learner(
             "value",
@@ -186,6 +193,7 @@ class Training:
         """Train the latent models on the offline data (equations (2), (3), (4), (5) and the classifiers)."""
         steps = self.config.offline
         self.dynamics.train(steps.dynamics_steps, "Dynamics", self.run)
+        self.background.train(steps.value_background_steps, "Value, background", self.run)
         self.value.train(steps.value_steps, "Value, reward-to-go", self.run)
         self.value_td.train(steps.value_td_steps, "Value, TD-1", self.run)
         self._train_classifiers(steps.classifier_steps)

@@ -17,7 +17,7 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from ls3_torchrl._checks import require_at_least, require_finite, require_keys
-from ls3_torchrl.data.labels import in_success, reward_to_go
+from ls3_torchrl.data.labels import failure_tail, in_success, reward_to_go
 from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.tags import ALL_TAGS, Tag
 from ls3_torchrl.modules.vae import PixelEncoder
@@ -34,6 +34,8 @@ class TaggedReplayBuffer:
         capacity: transitions kept; the oldest are overwritten.
         latent_dim: D.
         gamma: γ of the ``reward_to_go`` labels.
+        continue_failures: label episodes that never reach the goal as if they went on for ever
+            (:func:`~ls3_torchrl.data.failure_tail`), instead of ending with the horizon.
         pixel_capacity: frames kept; ``None`` makes room for the same episodes, frames at both ends included.
         scratch_dir: memory-map both stores below this folder instead of holding them in memory.
         device: where sampled batches live.
@@ -66,6 +68,7 @@ class TaggedReplayBuffer:
         *,
         latent_dim: int = 32,
         gamma: float = 0.99,
+        continue_failures: bool = False,
         pixel_capacity: int | None = None,
         scratch_dir: str | Path | None = None,
         device: torch.device | str = "cpu",
@@ -76,6 +79,7 @@ class TaggedReplayBuffer:
         self.pixel_capacity = require_at_least(room, 2, "pixel_capacity")
         self.latent_dim = require_at_least(latent_dim, 1, "latent_dim")
         self.gamma = gamma
+        self.continue_failures = continue_failures
         self.device = torch.device(device)
         folder = None if scratch_dir is None else Path(scratch_dir)
 
@@ -125,12 +129,13 @@ class TaggedReplayBuffer:
         self._frames_written += steps + 1
         self.pixels.extend(TensorDict({"pixels": frames}, [steps + 1]))
         reward, success = episode["next", "reward"], episode["next", "success"]
+        tail = failure_tail(reward, success, self.gamma) if self.continue_failures else None
         rows = TensorDict(
             {
                 "action": episode["action"],
                 "tag": torch.full((steps, 1), int(tag), dtype=torch.uint8),
                 "in_success": in_success(success),
-                "reward_to_go": reward_to_go(reward, self.gamma),
+                "reward_to_go": reward_to_go(reward, self.gamma, tail),
                 "frame": first + torch.arange(steps).unsqueeze(-1),
                 "next": {
                     "reward": reward,
