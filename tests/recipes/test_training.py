@@ -65,12 +65,13 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(config):
 
     buffer.sample = sample
     training = Training(agent, buffer, config, Silent())
-    for current in ("dynamics", "value", "value_td", "safe_set", "constraint", "goal"):
+    for current in ("dynamics", "background", "value", "value_td", "safe_set", "constraint", "goal"):
         with pytest.raises(KeyboardInterrupt):
             getattr(training, current).sample()
     everything = {"success", "rand", "constraint", "online"}
     assert drawn == {
         "dynamics": (everything, agent.dynamics.num_members),
+        "background": (everything, agent.value.num_members),
         "value": ({"success", "online"}, agent.value.num_members),
         "value_td": ({"success", "online"}, agent.value.num_members),
         "safe_set": (everything, None),
