@@ -12,9 +12,8 @@ from ls3_torchrl.data import save_episodes
 from rollout import collect_demonstrations
 
 
-@hydra.main(version_base="1.3", config_path="conf", config_name="collect")
-def main(config: DictConfig) -> None:
-    """Entry point."""
+def collect(config: DictConfig) -> Path:
+    """Collect and save; returns the folder. ``config`` is that of ``conf/collect.yaml``."""
     folder = Path(config.output)
     if folder.exists():
         raise FileExistsError(f"The output folder {folder} exists already. Choose another with output=DIR.")
@@ -27,6 +26,13 @@ def main(config: DictConfig) -> None:
             f"violation {s['violation_rate']:.0%}, return {s['return_mean']:.1f} ± {s['return_std']:.1f}"
         )
     console.print(f"Saved in [bold]{folder}[/bold]; train on them with data={folder}")
+    return folder
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="collect")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    collect(config)
 
 
 if __name__ == "__main__":

@@ -14,9 +14,15 @@ from ls3_torchrl import LS3Agent
 from rollout import make_env, run_episodes
 
 
-@hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
-def main(config: DictConfig) -> None:
-    """Entry point."""
+def evaluate(config: DictConfig) -> dict:
+    """Run episodes of a trained agent.
+
+    Args:
+        config: the resolved configuration of ``conf/evaluate.yaml``.
+
+    Returns:
+        What is written to ``summary.json``.
+    """
     folder = Path(config.run)
     if not (folder / "config.yaml").is_file():
         raise FileNotFoundError(f"{folder} is no run folder: config.yaml is missing. Pass run=DIR of a finished run.")
@@ -45,6 +51,13 @@ def main(config: DictConfig) -> None:
     run.write_json("summary.json", summary)
     run.close()
     print_summary(summary, run.path)
+    return summary
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    evaluate(config)
 
 
 if __name__ == "__main__":

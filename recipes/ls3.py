@@ -24,7 +24,7 @@ from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer, load_episodes, save_episodes
 from ls3_torchrl.planners import describe_plan
 from rollout import collect_demonstrations, make_env, run_episodes
-from training import Training
+from training import Training, check_settings
 
 
 def seeds(seed: int) -> dict[str, int]:
@@ -42,6 +42,7 @@ def train(config: DictConfig) -> dict:
     Returns:
         What is written to ``summary.json``.
     """
+    check_settings(config)
     device = choose_device(config.device)
     if config.threads:
         torch.set_num_threads(config.threads)

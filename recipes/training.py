@@ -37,6 +37,43 @@ def threads(count: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def check_settings(config: DictConfig) -> None:
+    """Refuse settings of the training that would only fail, or be passed over, after time was spent.
+
+    Raises:
+        ValueError: naming the setting, what was received and what is allowed.
+    """
+    vae = config.vae
+    allowed = {
+        "vae.schedule": (vae.schedule, ("constant", "onecycle")),
+        "vae.reduction": (vae.reduction, ("mean", "sum")),
+    }
+    for name, (value, choices) in allowed.items():
+        if value not in choices:
+            raise ValueError(f"{name} must be one of {', '.join(choices)}; got {value!r}.")
+    if vae.crop_scale is not None and not (
+        len(vae.crop_scale) == 2 and 0 < vae.crop_scale[0] <= vae.crop_scale[1] <= 1
+    ):
+        raise ValueError(f"vae.crop_scale must be null or [low, high] within (0, 1], got {vae.crop_scale}.")
+    positive = {
+        "vae.steps": vae.steps,
+        "vae.batch_size": vae.batch_size,
+        "vae.lr": vae.lr,
+        "optim.batch_size": config.optim.batch_size,
+        "optim.lr": config.optim.lr,
+        "optim.dynamics_lr": config.optim.dynamics_lr,
+        "optim.target_interval": config.optim.target_interval,
+        "online.episodes_per_update": config.online.episodes_per_update,
+        "evaluation.episodes": config.evaluation.episodes,
+    }
+    for name, value in positive.items():
+        if not value > 0:
+            raise ValueError(f"{name} must be positive, got {value}.")
+    rows = config.task.buffer_capacity
+    if rows < 1:
+        raise ValueError(f"task.buffer_capacity must be at least 1, got {rows}.")
+
+
 class Learner:
     """One loss, its optimiser, its lagged target and where its batches come from.
 

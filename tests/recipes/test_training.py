@@ -3,13 +3,14 @@
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import TaggedReplayBuffer
 from ls3_torchrl.modules import ValueEnsemble
 from ls3_torchrl.objectives import OfflineValueLoss, TD1ValueLoss
-from training import Learner, Training
+from training import Learner, Training, check_settings
 
 
 class Silent:
@@ -78,3 +79,21 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(config):
         "constraint": (everything, None),
         "goal": (everything, None),
     }
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("vae.schedule", "cosine"),
+        ("vae.reduction", "median"),
+        ("vae.crop_scale", [0.5, 1.5]),
+        ("vae.steps", 0),
+        ("optim.lr", -1.0),
+        ("online.episodes_per_update", 0),
+    ],
+)
+def test_settings_that_would_fail_late_are_refused_early(config, name, value):
+    check_settings(config)
+    OmegaConf.update(config, name, value)
+    with pytest.raises(ValueError, match=name.replace(".", r"\.")):
+        check_settings(config)
