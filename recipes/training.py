@@ -239,6 +239,7 @@ class Training:
         """One update on all data, after new episodes."""
         steps = self.config.online
         self.dynamics.train(steps.dynamics_steps, "Dynamics", self.run)
+        self.background.train(steps.value_background_steps, "Value, background", self.run)
         self.value_td.train(steps.value_td_steps, "Value, TD-1", self.run)
         self._train_classifiers(steps.classifier_steps)
 
