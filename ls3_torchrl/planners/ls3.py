@@ -98,6 +98,9 @@ class LS3Planner(MPCPlannerBase):
         pessimism: κ ≥ 0, subtracts κ standard deviations over the value ensemble; 0 is the paper.
         common_noise: judge all candidates of a row by the same particles (common random numbers), which
             compares them with less variance; ``False`` draws noise for each.
+        noise_scale: factor on the dynamics' learnt standard deviation, at least 0; 1 is the paper. With 0 the
+            particles differ by their members alone. Where latents are samples of wide posteriors, most of that
+            deviation is the posteriors' own, and with few particles it drowns what tells one plan from another.
         min_std: floor of the refitted standard deviation, a share of the action box's side.
         engine: ``"fused"`` runs a snapshot of the networks, ``"rollout"`` runs ``LatentEnv.rollout`` and takes
             any modules, ``"auto"`` the first where it can.
@@ -150,6 +153,7 @@ class LS3Planner(MPCPlannerBase):
         safe_set_reduction: SafeSetReduction = "mean",
         pessimism: float = 0.0,
         common_noise: bool = True,
+        noise_scale: float = 1.0,
         min_std: float = 0.0,
         engine: Engine = "auto",
         precision: Precision = "auto",
@@ -173,7 +177,10 @@ class LS3Planner(MPCPlannerBase):
         require_choice(engine, ("auto", "fused", "rollout"), "engine")
         if pessimism < 0.0:
             raise ValueError(f"pessimism must not be negative, got {pessimism}.")
+        if noise_scale < 0.0:
+            raise ValueError(f"noise_scale must not be negative, got {noise_scale}.")
         self.pessimism = pessimism
+        self.noise_scale = noise_scale
         self.common_noise = common_noise
         self.cem = CrossEntropyMethod(
             num_candidates=num_candidates,
@@ -223,7 +230,7 @@ class LS3Planner(MPCPlannerBase):
         candidates = 1 if self.common_noise else self.cem.num_candidates
         shape = (rows.numel(), self.horizon, self.num_particles, candidates, dynamics.latent_dim)
         members = draw_members(dynamics.num_members, self.horizon, self.num_particles, fixed=fixed, device=rows.device)
-        return ImaginationNoise(members, torch.randn(shape, device=rows.device))
+        return ImaginationNoise(members, self.noise_scale * torch.randn(shape, device=rows.device))
 
     def encode(self, tensordict: TensorDictBase) -> Tensor:
         """The latent ``[*B, D]`` to plan from."""

@@ -576,6 +576,7 @@ def test_probabilities_must_lie_strictly_between_zero_and_one(name, value):
         ({"max_relaxations": -1}, "at least 0, got -1"),
         ({"p_random": 1.5}, r"p_random must lie in \[0, 1\]"),
         ({"pessimism": -1.0}, "pessimism must not be negative"),
+        ({"noise_scale": -0.1}, "noise_scale must not be negative, got -0.1"),
         ({"min_std": -1.0}, "min_std must not be negative"),
         ({"engine": "jax"}, "engine must be one of 'auto', 'fused', 'rollout'; got 'jax'"),
         ({"precision": "fp8"}, "precision must be one of 'auto', 'fp32', 'bf16'; got 'fp8'"),
@@ -620,3 +621,14 @@ def test_statistics_judge_given_plans():
 def test_planning_keeps_no_graph():
     out = random_planner()(latents(2))
     assert not any(value.requires_grad for value in out.values(True, True))
+
+
+def test_noise_scale_multiplies_the_particles_noise_and_nothing_else():
+    rows = torch.arange(2)
+    drawn = {}
+    for scale in (0.0, 0.5, 1.0):
+        torch.manual_seed(0)
+        drawn[scale] = stub_planner(noise_scale=scale)._draw_imagination(rows, 0)
+    assert (drawn[0.0].noise == 0).all()
+    torch.testing.assert_close(drawn[0.5].noise, 0.5 * drawn[1.0].noise)
+    assert torch.equal(drawn[0.0].members, drawn[1.0].members)
