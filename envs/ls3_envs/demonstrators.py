@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -35,8 +37,9 @@ class _Scripted(TensorDictModuleBase):
         self._step = self._step + 1
         return tensordict.set("action", (action + noise).clamp(-MAX_STEP, MAX_STEP))
 
+    @abstractmethod
     def _act(self, state: Tensor, step: Tensor, is_init: Tensor) -> Tensor:
-        raise NotImplementedError
+        """Noiseless actions ``[N, A]`` at the worlds' steps ``[N, 1]``."""
 
 
 class NavigationDemonstrator(_Scripted):
