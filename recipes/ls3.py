@@ -23,6 +23,7 @@ from common import (
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer, load_episodes, save_episodes
 from ls3_torchrl.planners import describe_plan
+from probe import state_error
 from rollout import collect_demonstrations, make_env, run_episodes
 from training import Training, check_settings
 
@@ -83,6 +84,7 @@ def train(config: DictConfig) -> dict:
     training = Training(agent, buffer, config, run)
     with timed(seconds, "vae"):
         training.train_vae()
+    probe = state_error(agent, offline)
     with timed(seconds, "offline"):
         training.train_offline()
     agent.save(run.path / "checkpoints" / "agent_000.pt")
@@ -135,6 +137,7 @@ def train(config: DictConfig) -> dict:
         "seed": config.seed,
         "minutes": 0.0,
         "demonstrations": summarise(demonstrations),
+        **({"probe_error": round(probe, 3)} if probe is not None else {}),
         **({"online": summarise(online)} if online else {}),
         "evaluation": summarise([episode_figures(evaluation)]),
         "hardware": hardware(device),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -13,7 +13,7 @@ from torchrl.objectives import HardUpdate, LossModule
 
 from common import RunFolder, progress
 from ls3_torchrl import LS3Agent
-from ls3_torchrl.data import ALL_TAGS, VALUE_TAGS, TaggedReplayBuffer, random_resized_crop
+from ls3_torchrl.data import ALL_TAGS, VALUE_TAGS, Tag, TaggedReplayBuffer, random_resized_crop
 from ls3_torchrl.objectives import (
     ClassifierLoss,
     EnsembleDynamicsLoss,
@@ -24,6 +24,8 @@ from ls3_torchrl.objectives import (
 )
 
 LOG_EVERY = 100
+#: What can learn from the posteriors' means instead of samples.
+MEAN_LATENTS = ("dynamics", "constraint", "goal")
 
 
 @contextmanager
@@ -66,12 +68,43 @@ def check_settings(config: DictConfig) -> None:
         "online.episodes_per_update": config.online.episodes_per_update,
         "evaluation.episodes": config.evaluation.episodes,
     }
+    shares = {"vae.beta_warmup": vae.beta_warmup}
+    for name, value in shares.items():
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f"{name} must lie in [0, 1], got {value}.")
+    loss = config.loss
+    if loss.failure_weight < 0.0:
+        raise ValueError(f"loss.failure_weight must not be negative, got {loss.failure_weight}.")
+    unknown = set(loss.mean_latents) - set(MEAN_LATENTS)
+    if unknown:
+        raise ValueError(
+            f"loss.mean_latents must be some of {', '.join(MEAN_LATENTS)}; got {', '.join(sorted(unknown))}."
+        )
+    if loss.monte_carlo and not loss.continue_failures:
+        raise ValueError(
+            "loss.monte_carlo needs loss.continue_failures: otherwise a failure's return ends with the horizon and is "
+            "no lower bound."
+        )
     for name, value in positive.items():
         if not value > 0:
             raise ValueError(f"{name} must be positive, got {value}.")
     rows = config.task.buffer_capacity
     if rows < 1:
         raise ValueError(f"task.buffer_capacity must be at least 1, got {rows}.")
+
+
+class Term(NamedTuple):
+    """A second loss on the same network, with batches of its own.
+
+    Attributes:
+        weight: of its value in the sum.
+        loss: the loss module.
+        sample: draws a batch for it.
+    """
+
+    weight: float
+    loss: LossModule
+    sample: Callable[[], TensorDictBase]
 
 
 class Learner:
@@ -83,6 +116,7 @@ class Learner:
         sample: draws a batch.
         lr: Adam's learning rate.
         target_interval: gradient steps between copies to the target network; ``None`` without one.
+        beside: a second loss that is added to the first.
     """
 
     def __init__(
@@ -93,8 +127,9 @@ class Learner:
         *,
         lr: float,
         target_interval: int | None = None,
+        beside: Term | None = None,
     ) -> None:
-        self.name, self.loss, self.sample = name, loss, sample
+        self.name, self.loss, self.sample, self.beside = name, loss, sample, beside
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True)
         self.target_interval = target_interval
@@ -113,6 +148,10 @@ class Learner:
             for i in range(steps):
                 losses = self.loss(self.sample())
                 value = losses[f"loss_{self.name}"]
+                if self.beside is not None:
+                    second = self.beside.loss(self.beside.sample())[f"loss_{self.name}"]
+                    losses["beside"] = second.detach()
+                    value = value + self.beside.weight * second
                 self.optimizer.zero_grad()
                 value.backward()
                 self.optimizer.step()
@@ -151,22 +190,27 @@ class Training:
         members, values = agent.dynamics.num_members, agent.value.num_members
         goal = ClassifierLoss(agent.goal, name="goal")
         goal.set_keys(label=("next", "success"))
-        td1: dict[str, Any] = {"gamma": loss.gamma, "zero_at_goal": loss.zero_at_goal, "bootstrap": bootstrap}
+        td1: dict[str, Any] = {
+            "gamma": loss.gamma,
+            "zero_at_goal": loss.zero_at_goal,
+            "monte_carlo": loss.monte_carlo,
+            "bootstrap": bootstrap,
+        }
         self.dynamics = Learner(
             "dynamics",
             EnsembleDynamicsLoss(agent.dynamics, bootstrap=bootstrap),
             draw(ALL_TAGS, members),
             lr=optim.dynamics_lr,
         )
-        # The same equation on all offline data: what the values know of places that no success has visited.
-        self.background = Learner(
-            "value", OfflineValueLoss(agent.value, bootstrap=bootstrap), draw(ALL_TAGS, values), lr=optim.lr
-        )
+        failures = None
+        if loss.failure_weight > 0.0:
+            failures = Term(loss.failure_weight, OfflineValueLoss(agent.value, bootstrap=bootstrap), self._failures)
         self.value = Learner(
             "value",
             OfflineValueLoss(agent.value, bootstrap=bootstrap),
             draw(VALUE_TAGS, values),
             lr=optim.lr,
+            beside=failures,
         )
         self.value_td = Learner(
             "value",
@@ -184,6 +228,18 @@ class Training:
         )
         self.constraint = Learner("constraint", ClassifierLoss(agent.constraint), draw(ALL_TAGS), lr=optim.lr)
         self.goal = Learner("goal", goal, draw(ALL_TAGS), lr=optim.lr)
+        for name in loss.mean_latents:
+            keys = {"latent": "loc", "next_latent": ("next", "loc")}
+            getattr(self, name).loss.set_keys(**(keys if name == "dynamics" else {"latent": ("next", "loc")}))
+
+    def _failures(self) -> TensorDictBase:
+        """States of the violating demonstrations, labelled with the value of failure."""
+        optim, members = self.config.optim, self.agent.value.num_members
+        rows = self.buffer.sample(
+            max(optim.batch_size // 4, 1), tags=[Tag.CONSTRAINT], members=members if optim.bootstrap else None
+        )
+        value = self.config.loss.failure_value
+        return rows.set("reward_to_go", torch.full_like(rows["reward_to_go"], value))
 
     def train_vae(self) -> None:
         """Train encoder and decoder on all frames, freeze them, and encode every frame."""
@@ -201,6 +257,7 @@ class Training:
         device = next(agent.parameters()).device
         with threads(options.threads), progress(options.steps, "VAE") as bar:
             for i in range(options.steps):
+                loss.beta = options.beta * min(1.0, (i + 1) / max(options.beta_warmup * options.steps, 1.0))
                 target = self.buffer.sample_pixels(options.batch_size)["pixels"].to(device)
                 pixels = (
                     target
@@ -230,7 +287,6 @@ class Training:
         """Train the latent models on the offline data (equations (2), (3), (4), (5) and the classifiers)."""
         steps = self.config.offline
         self.dynamics.train(steps.dynamics_steps, "Dynamics", self.run)
-        self.background.train(steps.value_background_steps, "Value, background", self.run)
         self.value.train(steps.value_steps, "Value, reward-to-go", self.run)
         self.value_td.train(steps.value_td_steps, "Value, TD-1", self.run)
         self._train_classifiers(steps.classifier_steps)
@@ -239,7 +295,6 @@ class Training:
         """One update on all data, after new episodes."""
         steps = self.config.online
         self.dynamics.train(steps.dynamics_steps, "Dynamics", self.run)
-        self.background.train(steps.value_background_steps, "Value, background", self.run)
         self.value_td.train(steps.value_td_steps, "Value, TD-1", self.run)
         self._train_classifiers(steps.classifier_steps)
 

@@ -106,6 +106,11 @@ class TD1ValueLoss(LossModule):
         gamma: γ in [0, 1] (Table 1: 0.99).
         zero_at_goal: the target is 0 where the reward is 0, since the agent may stay in the goal set; this is
             what the authors' code does.
+        monte_carlo: the target is at least the return that was seen, max(r_t + γ V_θ'(z_{t+1}), Σ_{i≥0} γ^i r_{t+i}),
+            as in MCAC (Wilcox et al. 2022, arXiv 2210.07432, equation (1)). A return that was reached once bounds the
+            value of acting well from below, so that failures nearby do not wash out what demonstrations have shown.
+            The labels of failed episodes must not end with the horizon
+            (``TaggedReplayBuffer(continue_failures=True)``). ``False`` is the paper.
         bootstrap: the batch is ``[B, M]`` and member m learns from column m alone.
 
     Returns:
@@ -135,11 +140,13 @@ class TD1ValueLoss(LossModule):
             latent (NestedKey): z_t.
             next_latent (NestedKey): z_{t+1}.
             reward (NestedKey): r_t, the reward of the step from t.
+            reward_to_go (NestedKey): Σ_{i≥0} γ^i r_{t+i}, read with ``monte_carlo`` alone.
         """
 
         latent: NestedKey = "latent"
         next_latent: NestedKey = ("next", "latent")
         reward: NestedKey = ("next", "reward")
+        reward_to_go: NestedKey = "reward_to_go"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -154,6 +161,7 @@ class TD1ValueLoss(LossModule):
         *,
         gamma: float = 0.99,
         zero_at_goal: bool = True,
+        monte_carlo: bool = False,
         bootstrap: bool = False,
     ) -> None:
         super().__init__()
@@ -162,13 +170,15 @@ class TD1ValueLoss(LossModule):
         self.num_members = value.num_members
         self.gamma = check_discount(gamma)
         self.zero_at_goal = zero_at_goal
+        self.monte_carlo = monte_carlo
         self.bootstrap = bootstrap
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """The keys that are read, as ``set_keys`` left them."""
         keys = self.tensor_keys
-        return [keys.latent, keys.next_latent, keys.reward]
+        always = [keys.latent, keys.next_latent, keys.reward]
+        return [*always, keys.reward_to_go] if self.monte_carlo else always
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         pass
@@ -191,5 +201,8 @@ class TD1ValueLoss(LossModule):
         if self.bootstrap:
             check_members(latent, self.num_members, "TD1ValueLoss")
         target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.reward))
+        if self.monte_carlo:
+            seen = tensordict.get(keys.reward_to_go)
+            target = torch.maximum(target, seen if self.bootstrap else seen.unsqueeze(-2))
         value = evaluate(self.value, latent, params=self.value_params, per_member=self.bootstrap)
         return as_scalars(loss_value=(value - target).square().mean())

@@ -7,10 +7,10 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from ls3_torchrl import LS3Agent
-from ls3_torchrl.data import TaggedReplayBuffer
+from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.modules import ValueEnsemble
 from ls3_torchrl.objectives import OfflineValueLoss, TD1ValueLoss
-from training import Learner, Training, check_settings
+from training import Learner, Term, Training, check_settings
 
 
 class Silent:
@@ -66,13 +66,12 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(config):
 
     buffer.sample = sample
     training = Training(agent, buffer, config, Silent())
-    for current in ("dynamics", "background", "value", "value_td", "safe_set", "constraint", "goal"):
+    for current in ("dynamics", "value", "value_td", "safe_set", "constraint", "goal"):
         with pytest.raises(KeyboardInterrupt):
             getattr(training, current).sample()
     everything = {"success", "rand", "constraint", "online"}
     assert drawn == {
         "dynamics": (everything, agent.dynamics.num_members),
-        "background": (everything, agent.value.num_members),
         "value": ({"success", "online"}, agent.value.num_members),
         "value_td": ({"success", "online"}, agent.value.num_members),
         "safe_set": (everything, None),
@@ -81,10 +80,66 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(config):
     }
 
 
+def test_a_term_beside_the_loss_pulls_the_same_network_with_its_weight():
+    value = ValueEnsemble(4, num_members=1, hidden=(16,))
+    z, far = torch.zeros(32, 4), torch.ones(32, 4)
+    near_batch = TensorDict({"latent": z, "reward_to_go": torch.full((32, 1), -5.0)}, [32])
+    far_batch = TensorDict({"latent": far, "reward_to_go": torch.full((32, 1), -60.0)}, [32])
+    # On the same states, a term of weight 3 draws the least-squares value to three quarters of the way.
+    both = Term(3.0, OfflineValueLoss(value), lambda: far_batch.set("latent", z))
+    learner = Learner("value", OfflineValueLoss(value), lambda: near_batch, lr=0.05, beside=both)
+    run = Silent()
+    learner.train(600, "Value", run)
+    middle = (-5.0 + 3.0 * -60.0) / 4.0
+    assert value(TensorDict({"latent": z[:1]}, [1]))["state_value"].item() == pytest.approx(middle, abs=0.5)
+    assert "beside" in run.rows[-1][2]
+
+
+def test_failures_are_violating_demonstrations_at_the_value_of_failure(config):
+    OmegaConf.update(config, "loss.failure_weight", 0.5)
+    OmegaConf.update(config, "loss.failure_value", -42.0)
+    agent = LS3Agent(action_dim=2, **config.agent)
+    buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
+    step = {"reward": -torch.ones(9, 1), "pixels": torch.zeros(9, 3, 64, 64, dtype=torch.uint8)}
+    step |= {k: torch.zeros(9, 1, dtype=torch.bool) for k in ("constraint", "success")}
+    episode = TensorDict({"pixels": step["pixels"], "action": torch.zeros(9, 2), "next": step}, [9])
+    for tag in ("success", "constraint", "online"):
+        buffer.add(episode, tag)
+    buffer.encode(agent.encoder)
+    training = Training(agent, buffer, config, Silent())
+    rows = training.value.beside.sample()
+    assert (rows["tag"] == int(Tag.CONSTRAINT)).all()
+    assert (rows["reward_to_go"] == -42.0).all()
+    assert training.value.beside.weight == 0.5
+    # The buffer itself keeps the returns that were seen.
+    assert (buffer.sample(50, tags=["constraint"])["reward_to_go"] > -42.0).all()
+
+
+def test_mean_latents_feed_posterior_means_to_the_models_that_are_named(config):
+    OmegaConf.update(config, "loss.mean_latents", ["dynamics", "goal"])
+    agent = LS3Agent(action_dim=2, **config.agent)
+    training = Training(agent, TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim), config, Silent())
+    assert training.dynamics.loss.tensor_keys.latent == "loc"
+    assert training.dynamics.loss.tensor_keys.next_latent == ("next", "loc")
+    assert training.goal.loss.tensor_keys.latent == ("next", "loc")
+    assert training.constraint.loss.tensor_keys.latent == ("next", "latent")
+    assert training.safe_set.loss.tensor_keys.latent == "latent"
+
+
+def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_horizon(config):
+    OmegaConf.update(config, "loss.monte_carlo", True)
+    OmegaConf.update(config, "loss.continue_failures", False)
+    with pytest.raises(ValueError, match=r"loss\.continue_failures"):
+        check_settings(config)
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
         ("vae.schedule", "cosine"),
+        ("vae.beta_warmup", 1.5),
+        ("loss.failure_weight", -0.1),
+        ("loss.mean_latents", ["value"]),
         ("vae.reduction", "median"),
         ("vae.crop_scale", [0.5, 1.5]),
         ("vae.steps", 0),
