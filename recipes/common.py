@@ -177,4 +177,6 @@ def print_summary(summary: dict, folder: Path) -> None:
                 f"{s['return_mean']:.1f} ± {s['return_std']:.1f}",
             )
     console.print(table)
+    for name, value in summary.get("probe", {}).items():
+        console.print(f"{name.replace('_', ' ')}: {value:.2f} units of the state")
     console.print(f"{summary['minutes']:.1f} minutes; pictures, metrics and checkpoints are in [bold]{folder}[/bold]")

@@ -208,3 +208,18 @@ def test_sizes_below_one_are_refused():
         PixelEncoder(in_channels=0)
     with pytest.raises(ValueError, match="latent_dim must be at least 1"):
         PixelEncoder(latent_dim=0)
+
+
+@pytest.mark.parametrize(("kind", "size"), [(nn.Conv2d, 4), (nn.ConvTranspose2d, 1)])
+def test_layers_that_are_one_matrix_product_equal_the_convolution_with_its_gradients(kind: type, size: int):
+    torch.manual_seed(0)
+    modules = [*PixelEncoder(latent_dim=4).modules(), *PixelDecoder(latent_dim=4).modules()]
+    (layer,) = [m for m in modules if isinstance(m, kind) and type(m) is not kind]
+    x = torch.randn(3, layer.in_channels, size, size, requires_grad=True)
+    results = []
+    for forward in (layer.forward, lambda x: kind.forward(layer, x)):
+        out = forward(x)
+        results.append([out, *torch.autograd.grad(out.square().sum(), [x, *layer.parameters()])])
+    for mine, plain in zip(*results, strict=True):
+        assert mine.shape == plain.shape
+        assert torch.allclose(mine, plain, rtol=1e-4, atol=1e-4 * plain.abs().max().item())

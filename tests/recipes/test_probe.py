@@ -6,7 +6,7 @@ from tensordict import TensorDict
 
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag
-from probe import kernel_ridge, state_error
+from probe import StateProbe, kernel_ridge
 
 
 def test_kernel_ridge_solves_its_normal_equations():
@@ -30,17 +30,58 @@ class Reader(torch.nn.Module):
         return td.set("loc", torch.randn_like(corner) if self.blind else corner / 10.0)
 
 
+class Mover(torch.nn.Module):
+    """Stands for dynamics that move the latent by ``gain`` times the action."""
+
+    def __init__(self, gain):
+        super().__init__()
+        self.gain = gain
+
+    def distribution(self, latent, action):
+        mean = (latent + self.gain * action).unsqueeze(-2).expand(-1, 3, -1)
+        return mean, torch.ones_like(mean)
+
+
+def walks(steps, start=None):
+    """Episodes whose state, shown by one pixel of each channel, moves by ten times the action."""
+    action = torch.randint(-1, 2, (20, steps, 2)).float()
+    start = torch.randint(60, 140, (20, 1, 2)).float() if start is None else start
+    state = start + 10 * torch.cat([torch.zeros(20, 1, 2), action.cumsum(1)], 1)
+    pixels = torch.zeros(20, steps + 1, 3, 1, 1, dtype=torch.uint8)
+    pixels[..., :2, 0, 0] = state.clamp(0, 255).to(torch.uint8)
+    reached = {"state": state[:, 1:], "pixels": pixels[:, 1:]}
+    return TensorDict(
+        {"pixels": pixels[:, :-1], "state": state[:, :-1], "action": action, "next": reached}, [20, steps]
+    )
+
+
+def agent_with(encoder, dynamics=None):
+    agent = LS3Agent(action_dim=2, latent_dim=4)
+    agent.encoder = torch.nn.ModuleList([encoder])
+    if dynamics is not None:
+        agent.dynamics = dynamics
+    return agent
+
+
 @pytest.mark.parametrize("blind", [False, True])
 def test_the_error_is_small_where_the_latent_tells_the_state_and_large_where_it_does_not(blind):
     torch.manual_seed(0)
-    pixels = torch.randint(0, 200, (40, 50, 3, 64, 64), dtype=torch.uint8)[:, :, :, :1, :1].expand(-1, -1, -1, 2, 2)
-    episodes = TensorDict({"pixels": pixels, "state": pixels[..., :2, 0, 0].float()}, [40, 50])
-    agent = LS3Agent(action_dim=2, latent_dim=4)
-    agent.encoder = torch.nn.ModuleList([Reader(blind)])
-    error = state_error(agent, {Tag.SUCCESS: episodes}, frames=1500)
-    assert (error > 50.0) if blind else (error < 3.0)
+    error = StateProbe(agent_with(Reader(blind)), {Tag.SUCCESS: walks(6)}).error
+    assert (error > 10.0) if blind else (error < 2.0)
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.0])
+def test_imagined_ends_are_compared_with_where_the_actions_led(gain):
+    torch.manual_seed(0)
+    episodes = walks(6)
+    probe = StateProbe(agent_with(Reader(False), Mover(gain)), {Tag.SUCCESS: episodes})
+    error = probe.imagination_error(episodes, horizon=3, stride=1)
+    starts, ends = episodes["state"][:, :4], episodes["next", "state"][:, 2:]
+    moved = (ends - starts).norm(dim=-1).mean().item()
+    assert error < 3.0 if gain else error == pytest.approx(moved, abs=2.0)
 
 
 def test_without_states_there_is_nothing_to_probe():
     episodes = TensorDict({"pixels": torch.zeros(2, 3, 3, 64, 64, dtype=torch.uint8)}, [2, 3])
-    assert state_error(LS3Agent(action_dim=2, latent_dim=4), {Tag.SUCCESS: episodes}) is None
+    with pytest.raises(KeyError, match="state"):
+        StateProbe(LS3Agent(action_dim=2, latent_dim=4), {Tag.SUCCESS: episodes})
