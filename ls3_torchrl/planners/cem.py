@@ -33,7 +33,7 @@ class Evaluate(Protocol):
 
 
 #: Draws the noise of one population: (rows ``[b]``, population) -> standard normal and uniform in [0, 1), each
-#: ``[b, N, H, A]``; the uniform one covers the first ``num_random`` candidates at least.
+#: ``[b, N, H, A]``; the uniform one covers the first ``num_random + num_constant`` candidates at least.
 CandidateNoise = Callable[[Tensor, int], tuple[Tensor, Tensor]]
 
 
@@ -62,8 +62,8 @@ class CEMResult(NamedTuple):
 class CrossEntropyMethod:
     """Sample, score, keep the elites, refit; for a batch of independent problems side by side.
 
-    In the first round ``p_random`` of the candidates are uniform in the box and the rest come from the given
-    Gaussian; later rounds sample the refitted one, clamped to the box. A row in which nothing is feasible
+    In the first round ``p_random`` of the candidates are uniform in the box, ``p_constant`` of them hold one
+    uniform action, and the rest come from the given Gaussian; later rounds sample the refitted one, clamped to the box. A row in which nothing is feasible
     starts again from its first round, up to ``max_restarts`` times; after that it takes the sequence with the
     best fallback ranking (unless an earlier round had found a feasible one). The outcome is the best sequence
     that was scored: no population is drawn without being scored.
@@ -74,6 +74,9 @@ class CrossEntropyMethod:
         optim_steps: rounds, each scored.
         max_restarts: how often a row may start again.
         p_random: share of uniform candidates in the first round, in [0, 1].
+        p_constant: share of candidates in the first round that hold one uniform action over the whole horizon.
+            Actions drawn independently step by step mostly cancel; a way that has to be kept up is found among
+            correlated ones (as in Pinneri et al. 2020, arXiv 2008.06389). 0 is the paper.
         min_std: floor of the refitted standard deviation as a share of the box's side; 0 is the paper.
 
     Raises:
@@ -99,6 +102,7 @@ class CrossEntropyMethod:
         optim_steps: int,
         max_restarts: int = 5,
         p_random: float = 1.0,
+        p_constant: float = 0.0,
         min_std: float = 0.0,
     ) -> None:
         self.num_candidates = require_at_least(num_candidates, 1, "num_candidates")
@@ -106,18 +110,29 @@ class CrossEntropyMethod:
             raise ValueError(f"num_elites must lie between 1 and num_candidates = {num_candidates}, got {num_elites}.")
         if not 0.0 <= p_random <= 1.0:
             raise ValueError(f"p_random must lie in [0, 1], got {p_random}.")
+        if not 0.0 <= p_constant <= 1.0 or p_random + p_constant > 1.0:
+            raise ValueError(
+                f"p_constant must lie in [0, 1] and leave room for p_random, got p_constant={p_constant} and "
+                f"p_random={p_random}: together they must not exceed 1."
+            )
         if min_std < 0.0:
             raise ValueError(f"min_std must not be negative, got {min_std}.")
         self.num_elites = num_elites
         self.optim_steps = require_at_least(optim_steps, 1, "optim_steps")
         self.max_restarts = require_at_least(max_restarts, 0, "max_restarts")
         self.p_random = p_random
+        self.p_constant = p_constant
         self.min_std = min_std
 
     @property
     def num_random(self) -> int:
         """How many candidates of a first round are uniform."""
         return round(self.p_random * self.num_candidates)
+
+    @property
+    def num_constant(self) -> int:
+        """How many candidates of a first round hold one action over the horizon."""
+        return min(round(self.p_constant * self.num_candidates), self.num_candidates - self.num_random)
 
     @property
     def max_populations(self) -> int:
@@ -163,13 +178,17 @@ class CrossEntropyMethod:
         step = torch.zeros(batch, dtype=torch.long, device=device)
         restarts, populations = torch.zeros_like(step), torch.zeros_like(step)
         found = torch.zeros(batch, dtype=torch.bool, device=device)
-        uniform_first = torch.arange(self.num_candidates, device=device) < self.num_random
+        index = torch.arange(self.num_candidates, device=device)
+        uniform_first = index < self.num_random + self.num_constant
+        constant = (uniform_first & (index >= self.num_random))[:, None, None]
 
         rows = torch.arange(batch, device=device)
         population = 0
         while rows.numel():
             normal, uniform = self.draw(rows, horizon, shape[-1]) if noise is None else noise(rows, population)
             actions = mean[rows, None] + std[rows, None] * normal
+            if self.num_constant:
+                uniform = torch.where(constant, uniform[..., :1, :], uniform)
             is_uniform = (step[rows] == 0)[:, None] & uniform_first
             actions = torch.where(is_uniform[..., None, None], low + side * uniform, actions)
             actions = actions.clamp(low, high)

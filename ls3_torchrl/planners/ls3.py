@@ -91,6 +91,7 @@ class LS3Planner(MPCPlannerBase):
         relaxation: factor on δ_S when nothing is feasible, strictly between 0 and 1.
         max_relaxations: how often δ_S may be relaxed in one plan.
         p_random: share of uniform candidates in the first round; the rest are drawn round the last plan.
+        p_constant: share of candidates in the first round that hold one uniform action over the horizon.
         constraint_reduction: over particles, ``"max"`` as the authors' code or ``"mean"``.
         safe_set_reduction: over particles, ``"mean"`` as the authors' code or ``"min"``: every particle must end
             in the safe set. A mean of δ_S lets a share 1 − δ_S of the particles end anywhere, and a plan gains from
@@ -149,6 +150,7 @@ class LS3Planner(MPCPlannerBase):
         relaxation: float = 0.8,
         max_relaxations: int = 5,
         p_random: float = 1.0,
+        p_constant: float = 0.0,
         constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
         pessimism: float = 0.0,
@@ -188,6 +190,7 @@ class LS3Planner(MPCPlannerBase):
             optim_steps=optim_steps,
             max_restarts=max_relaxations,
             p_random=p_random,
+            p_constant=p_constant,
             min_std=min_std,
         )
         self.value, self.safe_set, self.encoder = value, safe_set, encoder
