@@ -63,10 +63,10 @@ class CrossEntropyMethod:
     """Sample, score, keep the elites, refit; for a batch of independent problems side by side.
 
     In the first round ``p_random`` of the candidates are uniform in the box, ``p_constant`` of them hold one
-    uniform action, and the rest come from the given Gaussian; later rounds sample the refitted one, clamped to the box. A row in which nothing is feasible
-    starts again from its first round, up to ``max_restarts`` times; after that it takes the sequence with the
-    best fallback ranking (unless an earlier round had found a feasible one). The outcome is the best sequence
-    that was scored: no population is drawn without being scored.
+    uniform action, and the rest come from the given Gaussian; later rounds sample the refitted one, clamped to
+    the box. A row in which nothing is feasible starts again from its first round, up to ``max_restarts`` times;
+    after that it takes the sequence with the best fallback ranking (unless an earlier round had found a feasible
+    one). The outcome is the best sequence that was scored: no population is drawn without being scored.
 
     Args:
         num_candidates: N.

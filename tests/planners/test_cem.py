@@ -269,6 +269,39 @@ def test_p_random_shares_the_first_round_between_box_and_warm_start(p_random, ex
     assert result.populations.tolist() == [2]
 
 
+def test_held_candidates_repeat_their_first_uniform_action_in_the_first_round_alone():
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=2, p_random=0.3, p_constant=0.4)
+    record = Record(quadratic([-2.0, 1.0]))
+    normal, uniform, noise = table(2, cem, 3)
+    kept = uniform.clone()
+    cem(record, LOW, HIGH, batch=2, horizon=3, noise=noise)
+    first, second = record.asked[0][0], record.asked[1][0]
+    box = LOW + (HIGH - LOW) * uniform[0]
+    torch.testing.assert_close(first[:, :3], box[:, :3])
+    torch.testing.assert_close(first[:, 3:7], box[:, 3:7, :1].expand(-1, -1, 3, -1))
+    middle, quarter = (LOW + HIGH) / 2, (HIGH - LOW) / 4
+    torch.testing.assert_close(first[:, 7:], (middle + quarter * normal[0, :, 7:]).clamp(LOW, HIGH))
+    assert not (second[:, :, 0] == second[:, :, 1]).all(-1).any()
+    assert torch.equal(uniform, kept)
+
+
+def test_held_candidates_find_what_must_be_kept_up():
+    # Only sequences that go up at nearly full speed at every step score: independent draws hardly ever do.
+    def judge(actions, rows, restarts, population):
+        score = torch.where((actions[..., 0] > 0.8).all(-1), 1.0, 0.0)
+        return Judgement(score, torch.ones_like(score, dtype=torch.bool), score)
+
+    box = torch.tensor([-1.0]), torch.tensor([1.0])
+    settings = {"num_candidates": 100, "num_elites": 10, "optim_steps": 1}
+    found = []
+    for p_constant in (0.0, 0.5):
+        torch.manual_seed(0)
+        cem = CrossEntropyMethod(p_random=0.5, p_constant=p_constant, **settings)
+        found.append(cem(judge, *box, batch=50, horizon=5).score.mean().item())
+    assert found[0] < 0.1
+    assert found[1] > 0.9
+
+
 def test_without_a_start_the_gaussian_covers_the_box():
     cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=1, p_random=0.0)
     normal, _, noise = table(1, cem, 2)
@@ -344,6 +377,8 @@ def test_the_given_start_is_left_as_it_was():
         ({"max_restarts": -1}, "max_restarts must be at least 0"),
         ({"p_random": 1.1}, r"p_random must lie in \[0, 1\]"),
         ({"p_random": -0.1}, r"p_random must lie in \[0, 1\]"),
+        ({"p_constant": -0.1}, r"p_constant must lie in \[0, 1\]"),
+        ({"p_random": 0.6, "p_constant": 0.5}, "together they must not exceed 1"),
         ({"min_std": -0.1}, "min_std must not be negative"),
     ],
 )
