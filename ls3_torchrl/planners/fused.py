@@ -16,9 +16,9 @@ from ls3_torchrl._checks import require_choice
 from ls3_torchrl.modules.classifiers import LatentClassifier
 from ls3_torchrl.modules.ensemble import EnsembleMLP
 from ls3_torchrl.modules.value import ValueEnsemble
-from ls3_torchrl.planners.imagination import ImaginationNoise
+from ls3_torchrl.planners.imagination import ImaginationNoise, Limits
 from ls3_torchrl.planners.latent_env import LatentEnv
-from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction
+from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction, feasible
 
 Precision = Literal["auto", "fp32", "bf16"]
 #: A network's layers: weight ``[out, in]`` and bias ``[out]``, ReLU between them.
@@ -208,8 +208,14 @@ class FusedImagination:
         return True
 
     @torch.no_grad()
-    def __call__(self, latent: Tensor, actions: Tensor, noise: ImaginationNoise) -> PlanStatistics:
-        """Statistics of ``actions`` ``[b, N, H, A]`` carried out from ``latent`` ``[b, D]``."""
+    def __call__(
+        self, latent: Tensor, actions: Tensor, noise: ImaginationNoise, limits: Limits | None = None
+    ) -> PlanStatistics:
+        """Statistics of ``actions`` ``[b, N, H, A]`` carried out from ``latent`` ``[b, D]``.
+
+        With ``limits``, plans that are not feasible under them get neither values nor goal probabilities (NaN): the
+        planner masks their scores anyway, and most plans of a first round are not.
+        """
         self.refresh()
         b, n, horizon, _ = actions.shape
         workers = torch.get_num_threads() if latent.device.type == "cpu" else 1
@@ -222,7 +228,8 @@ class FusedImagination:
             shared = noise.noise.shape[3] == 1
             step_noise = noise.noise[row] if shared else noise.noise[row, :, :, part]
             plan = actions[row, part].transpose(0, 1).contiguous()
-            return self._judge(latent[row], plan, noise.members, step_noise)
+            own = None if limits is None else limits._replace(safe_set_threshold=limits.safe_set_threshold[row])
+            return self._judge(latent[row], plan, noise.members, step_noise, own)
 
         out = PlanStatistics(
             value=latent.new_empty(b, n, len(self._value)),
@@ -236,33 +243,52 @@ class FusedImagination:
         return out
 
     @torch.no_grad()
-    def _judge(self, latent: Tensor, plan: Tensor, members: Tensor, noise: Tensor) -> PlanStatistics:
+    def _judge(
+        self, latent: Tensor, plan: Tensor, members: Tensor, noise: Tensor, limits: Limits | None
+    ) -> PlanStatistics:
         """Statistics of the plans ``[H, R, A]`` from one latent ``[D]`` under noise ``[H, P, R or 1, D]``."""
         horizon, r, _ = plan.shape
         particles = noise.shape[1]
-        value = latent.new_zeros(r, len(self._value))
-        goal, constraint = latent.new_zeros(r, horizon), latent.new_zeros(r, horizon)
+        constraint = latent.new_zeros(r, horizon)
         safe = latent.new_full((r,), float(self.safe_set_reduction == "min"))
         group = max(1, self.block // r)
+        groups = []
         for first in range(0, particles, group):
             chosen = slice(first, min(first + group, particles))
             states = self._carry(latent, plan, members[:, chosen], noise[:, chosen])
-            goal += self._probability("goal", states).sum(0).T
+            groups.append(states)
             violating = self._probability("constraint", states)
             if self.constraint_reduction == "max":
                 constraint = torch.maximum(constraint, violating.amax(0).T)
             else:
                 constraint += violating.sum(0).T / particles
-            end = states[:, -1]
-            in_safe_set = self._probability("safe_set", end)
+            in_safe_set = self._probability("safe_set", states[:, -1])
             if self.safe_set_reduction == "min":
                 safe = torch.minimum(safe, in_safe_set.amin(0))
             else:
                 safe += in_safe_set.sum(0) / particles
-            flat = end.reshape(-1, end.shape[-1])
+
+        value, goal = latent.new_full((r, len(self._value)), torch.nan), latent.new_full((r, horizon), torch.nan)
+        found = PlanStatistics(value, goal, constraint, safe)
+        wanted = torch.arange(r, device=latent.device)
+        if limits is not None:
+            allowed = feasible(
+                found,
+                safe_set_threshold=limits.safe_set_threshold,
+                constraint_threshold=limits.constraint_threshold,
+            )
+            wanted = allowed.nonzero().flatten()
+        if not len(wanted):
+            return found
+        values, goals = value.new_zeros(len(wanted), value.shape[1]), goal.new_zeros(len(wanted), horizon)
+        for states in groups:
+            kept = states if len(wanted) == r else states[:, :, wanted]
+            goals += self._probability("goal", kept).sum(0).T
+            ends = kept[:, -1].reshape(-1, kept.shape[-1])
             for m, layers in enumerate(self._value):
-                value[:, m] += run_layers(flat, layers).float().reshape(-1, r).sum(0)
-        return PlanStatistics(value / particles, goal / particles, constraint, safe)
+                values[:, m] += run_layers(ends, layers).float().reshape(-1, len(wanted)).sum(0)
+        value[wanted], goal[wanted] = values / particles, goals / particles
+        return found
 
     def _probability(self, head: str, states: Tensor) -> Tensor:
         """Probabilities ``[...]`` by a head of latents ``[..., D]``."""

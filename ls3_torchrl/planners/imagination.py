@@ -27,11 +27,28 @@ class ImaginationNoise(NamedTuple):
     noise: Tensor
 
 
+class Limits(NamedTuple):
+    """What makes a plan feasible.
+
+    Attributes:
+        safe_set_threshold: δ_S of each row, ``[b, 1]``.
+        constraint_threshold: δ_C.
+    """
+
+    safe_set_threshold: Tensor
+    constraint_threshold: float
+
+
 class Imagination(Protocol):
     """Imagines candidate plans and reduces what it sees over the particles."""
 
-    def __call__(self, latent: Tensor, actions: Tensor, noise: ImaginationNoise) -> PlanStatistics:
-        """Statistics of ``actions`` ``[b, N, H, A]`` carried out from ``latent`` ``[b, D]``."""
+    def __call__(
+        self, latent: Tensor, actions: Tensor, noise: ImaginationNoise, limits: Limits | None = None
+    ) -> PlanStatistics:
+        """Statistics of ``actions`` ``[b, N, H, A]`` carried out from ``latent`` ``[b, D]``.
+
+        With ``limits``, value and goal of infeasible plans may be left out (NaN): nothing depends on them.
+        """
 
 
 def draw_members(num_members: int, horizon: int, particles: int, *, fixed: bool, device: torch.device) -> Tensor:
@@ -79,8 +96,10 @@ class RolloutImagination:
         self.safe_set_reduction = safe_set_reduction
 
     @torch.no_grad()
-    def __call__(self, latent: Tensor, actions: Tensor, noise: ImaginationNoise) -> PlanStatistics:
-        """Statistics of ``actions`` ``[b, N, H, A]`` carried out from ``latent`` ``[b, D]``."""
+    def __call__(
+        self, latent: Tensor, actions: Tensor, noise: ImaginationNoise, limits: Limits | None = None
+    ) -> PlanStatistics:
+        """Statistics of ``actions`` ``[b, N, H, A]`` carried out from ``latent`` ``[b, D]``; all of them, always."""
         b, n, horizon, _ = actions.shape
         p, d = noise.members.shape[1], latent.shape[-1]
         dynamics = self.env.dynamics

@@ -26,6 +26,7 @@ from ls3_torchrl.planners.fused import FusedImagination, Precision
 from ls3_torchrl.planners.imagination import (
     Imagination,
     ImaginationNoise,
+    Limits,
     RolloutImagination,
     draw_members,
 )
@@ -279,8 +280,9 @@ class LS3Planner(MPCPlannerBase):
                 drawn = self._draw_imagination(rows, population)
             else:
                 drawn = ImaginationNoise(noise.members[population], noise.dynamics[population][rows])
-            statistics = self.imagine(latent[rows], actions, drawn)
-            return self.judge(statistics, self._threshold(restarts).unsqueeze(-1))
+            threshold = self._threshold(restarts).unsqueeze(-1)
+            limits = Limits(threshold, self.constraint_threshold)
+            return self.judge(self.imagine(latent[rows], actions, drawn, limits), threshold)
 
         def candidates(rows: Tensor, population: int) -> tuple[Tensor, Tensor]:
             if noise is None:

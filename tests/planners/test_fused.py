@@ -5,8 +5,9 @@ from torch import nn
 from torchrl.data import Bounded
 
 from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
-from ls3_torchrl.planners import FusedImagination, ImaginationNoise, LatentEnv, RolloutImagination
+from ls3_torchrl.planners import FusedImagination, ImaginationNoise, LatentEnv, RolloutImagination, feasible
 from ls3_torchrl.planners.fused import fastest_precision, run_layers
+from ls3_torchrl.planners.imagination import Limits
 
 D, A, M = 4, 2, 3
 B, N, H, P = 2, 7, 3, 4
@@ -67,6 +68,25 @@ def test_blocks_are_a_matter_of_speed_only(block):
     common = ImaginationNoise(noise.members, noise.noise[:, :, :, :1])
     whole = fused_of(parts, precision="fp32")(latent, actions, common)
     assert_same(fused_of(parts, precision="fp32", block=block)(latent, actions, common), whole)
+
+
+@pytest.mark.parametrize("block", [1024, 10])
+@pytest.mark.parametrize("share", [0.0, 0.7, 1.0])
+def test_with_limits_only_what_is_feasible_is_valued_and_nothing_else_changes(share, block):
+    imagine = fused_of(build(), precision="fp32", block=block)
+    whole = imagine(*problem())
+    # Half of the plans end safely enough, and none or some or all of those keep to the constraint.
+    constraint_threshold = whole.constraint_prob.amax(-1).quantile(share).item() + (1e-6 if share else -1e-6)
+    limits = Limits(whole.safe_set_prob.median(dim=1, keepdim=True).values, constraint_threshold)
+    part = imagine(*problem(), limits)
+    allowed = feasible(whole, safe_set_threshold=limits.safe_set_threshold, constraint_threshold=constraint_threshold)
+    assert allowed.any() == (share > 0.0)
+    assert not allowed.all()
+    for name in ("constraint_prob", "safe_set_prob"):
+        assert torch.equal(getattr(part, name), getattr(whole, name))
+    for name in ("value", "goal_prob"):
+        torch.testing.assert_close(getattr(part, name)[allowed], getattr(whole, name)[allowed])
+        assert getattr(part, name)[~allowed].isnan().all()
 
 
 def test_a_snapshot_is_taken_only_when_something_changed():
