@@ -1,0 +1,345 @@
+"""How long everything takes on this machine, beside a plain fp32 eager path in the same run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from hydra import compose
+from omegaconf import DictConfig, OmegaConf
+from rich.table import Table
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch.utils.benchmark import Timer
+from torchrl.data import Bounded
+
+import ls3_envs
+from common import RunFolder, choose_device, console, hardware
+from ls3_torchrl import LS3Agent
+from ls3_torchrl.data import Tag, TaggedReplayBuffer
+from ls3_torchrl.modules.ensemble import EnsembleMLP
+from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, VAELoss
+from ls3_torchrl.planners import LS3Planner
+
+
+class Bench:
+    """Collects figures.
+
+    Args:
+        seconds: at least so long is measured for each figure.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self.rows: list[dict[str, Any]] = []
+
+    def time(self, what: str, call: Callable[[], object], *, per: int = 1, against: str | None = None) -> float:
+        """Time ``call``.
+
+        Args:
+            what: the figure's name.
+            call: what is timed.
+            per: how many things one call does; the figure is of one.
+            against: name of an earlier figure that this one is compared to.
+
+        Returns:
+            The median, in seconds, of one thing.
+        """
+        call()
+        timer = Timer("call()", globals={"call": call}, num_threads=torch.get_num_threads())
+        found = timer.blocked_autorange(min_run_time=self.seconds)
+        median = found.median / per
+        earlier = {row["what"]: row["median_ms"] for row in self.rows}
+        row: dict[str, Any] = {
+            "what": what,
+            "median_ms": 1e3 * median,
+            "iqr_ms": 1e3 * found.iqr / per,
+            "runs": len(found.times),
+        }
+        if against is not None and against in earlier:
+            row |= {"against": against, "times_faster": earlier[against] / row["median_ms"]}
+        self.rows.append(row)
+        faster = f"  {row['times_faster']:.1f} times faster than {against}" if "times_faster" in row else ""
+        console.print(f"{what:<46}{row['median_ms']:10.3f} ms{faster}")
+        return median
+
+
+def matmul_peak(bench: Bench, dtype: torch.dtype, device: torch.device, size: int = 2048) -> float:
+    """The most FLOP/s that a square product reaches here."""
+    a, b = (torch.randn(size, size, device=device).to(dtype) for _ in range(2))
+    name = str(dtype).removeprefix("torch.")
+    return 2 * size**3 / bench.time(f"product of {size} x {size}, {name}", lambda: a @ b)
+
+
+def permissive(agent: LS3Agent) -> LS3Agent:
+    """Make every plan of an untrained agent feasible: the most work that a plan of four rounds can be."""
+    with torch.no_grad():
+        for head, bias in ((agent.constraint, -20.0), (agent.goal, -20.0), (agent.safe_set, 20.0)):
+            layers = [layer for layer in head.network.modules() if isinstance(layer, nn.Linear)]
+            layers[-1].bias.fill_(bias)
+    return agent
+
+
+def plan_flops(agent: LS3Agent, options: dict[str, Any]) -> float:
+    """Floating-point operations of the matrix products in one plan of which every candidate is feasible."""
+
+    def network(sizes: Sequence[int]) -> int:
+        return sum(a * b for a, b in pairwise(sizes))
+
+    def head(module: nn.Module) -> int:
+        return sum(layer.weight.numel() for layer in module.modules() if isinstance(layer, nn.Linear))
+
+    def member(net: EnsembleMLP) -> int:
+        return network([net.weights[0].shape[1], *(weight.shape[2] for weight in net.weights)])
+
+    steps = member(agent.dynamics.network) + head(agent.constraint) + head(agent.goal)
+    end = head(agent.safe_set) + agent.value.num_members * member(agent.value.network)
+    paths = options["num_candidates"] * options["num_particles"] * options["optim_steps"]
+    return 2.0 * paths * (options["horizon"] * steps + end)
+
+
+def plans(
+    bench: Bench, preset: DictConfig, spec: Bounded, batches: Sequence[int], device: torch.device, *, plain: bool
+) -> None:
+    """Plans of a preset: the plain path, the fused one in each precision, and batches of environments."""
+    torch.manual_seed(0)
+    agent = permissive(LS3Agent(spec.shape[-1], **preset.agent)).to(device)
+    options = {str(key): value for key, value in preset.planner.items()}
+    name = preset.preset
+    flops = plan_flops(agent, options)
+
+    def planner(**changes: Any) -> LS3Planner:
+        return agent.planner(spec, **(options | changes))
+
+    def plan(policy: LS3Planner, batch: int) -> Callable[[], object]:
+        latent = torch.randn(batch, preset.agent.latent_dim, device=device)
+        return lambda: policy.plan(latent)
+
+    base = f"plan, {name}, plain"
+    if plain:
+        bench.time(base, plan(planner(engine="rollout"), 1))
+    for precision in ("fp32", "bf16"):
+        median = bench.time(f"plan, {name}, {precision}", plan(planner(precision=precision), 1), against=base)
+        bench.rows[-1]["gflops"] = flops / median / 1e9
+    for batch in batches:
+        if batch > 1:
+            figure = f"plan, {name}, auto, each of {batch}"
+            bench.time(figure, plan(planner(), batch), per=batch, against=base)
+
+
+def _plain_members(sizes: Sequence[int], count: int) -> list[nn.Sequential]:
+    return [
+        nn.Sequential(*(layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU())))[:-1]
+        for _ in range(count)
+    ]
+
+
+def updates(bench: Bench, preset: DictConfig, action_dim: int, device: torch.device, *, plain: bool) -> None:
+    """Gradient steps of a preset's losses; dynamics and values also as a loop over members."""
+    agent = LS3Agent(action_dim, **preset.agent).to(device)
+    batch, d, name = preset.optim.batch_size, preset.agent.latent_dim, preset.preset
+    members = agent.value.num_members
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as the recipes do
+
+    def tensors(*shape: int) -> TensorDict:
+        data = {"latent": torch.randn(*shape, d), "action": torch.randn(*shape, action_dim)}
+        data |= {"reward_to_go": -torch.rand(*shape, 1), "in_success": torch.ones(*shape, 1).bool()}
+        return TensorDict(data | {"next": {"latent": torch.randn(*shape, d)}}, list(shape), device=device)
+
+    def step(loss: nn.Module, key: str, rows: TensorDict) -> Callable[[], object]:
+        optimizer = torch.optim.Adam([p for p in loss.parameters() if p.requires_grad], lr=1e-4, fused=True)
+
+        def take() -> None:
+            value = loss(rows)[key]
+            optimizer.zero_grad()
+            value.backward()
+            optimizer.step()
+
+        return take
+
+    def loop(sizes: Sequence[int], inputs: Tensor, error: Callable[[Tensor, int], Tensor]) -> Callable[[], object]:
+        networks = _plain_members(sizes, members)
+        optimizers = [torch.optim.Adam(network.parameters(), lr=1e-4) for network in networks]
+
+        def take() -> None:
+            for m, (network, optimizer) in enumerate(zip(networks, optimizers, strict=True)):
+                value = error(network.to(device)(inputs[:, m]), m)
+                optimizer.zero_grad()
+                value.backward()
+                optimizer.step()
+
+        return take
+
+    rows = tensors(batch, members)
+    z, action, reached, returns = rows["latent"], rows["action"], rows["next", "latent"], rows["reward_to_go"]
+
+    def likelihood(out: Tensor, m: int) -> Tensor:
+        delta, log_scale = out.chunk(2, -1)
+        normal = torch.distributions.Normal(z[:, m] + delta, log_scale.clamp(-8, 4).exp())
+        return -normal.log_prob(reached[:, m]).mean()
+
+    dynamics = f"dynamics step, {name}, loop over members"
+    values = f"value step, {name}, loop over members"
+    if plain:
+        sizes = [d + action_dim, *preset.agent.dynamics_hidden, 2 * d]
+        bench.time(dynamics, loop(sizes, torch.cat([z, action], -1), likelihood))
+        sizes = [d, *preset.agent.value_hidden, 1]
+        bench.time(values, loop(sizes, z, lambda out, m: (out - returns[:, m]).square().mean()))
+    loss = EnsembleDynamicsLoss(agent.dynamics, bootstrap=True)
+    bench.time(f"dynamics step, {name}", step(loss, "loss_dynamics", rows), against=dynamics)
+    bench.time(
+        f"value step, {name}",
+        step(OfflineValueLoss(agent.value, bootstrap=True), "loss_value", rows),
+        against=values,
+    )
+    bench.time(f"safe set step, {name}", step(SafeSetLoss(agent.safe_set, gamma=0.3), "loss_safe_set", tensors(batch)))
+    torch.set_num_threads(threads)
+
+
+class _PlainVAE(nn.Module):
+    """The VAE's layers in eager PyTorch with nothing done for speed."""
+
+    def __init__(self, agent: LS3Agent) -> None:
+        super().__init__()
+
+        def plain(layer: nn.Module) -> nn.Module:
+            for kind in (nn.Conv2d, nn.ConvTranspose2d):
+                if isinstance(layer, kind):
+                    (kernel, _), (stride, _) = layer.kernel_size, layer.stride
+                    return kind(layer.in_channels, layer.out_channels, kernel, stride)
+            return layer
+
+        posterior = next(m for m in agent.encoder.modules() if hasattr(m, "convolutions"))
+        self.convolutions = nn.Sequential(*map(plain, posterior.convolutions))
+        self.head = nn.Linear(256, 2 * agent.encoder.latent_dim)
+        self.decoder = nn.Sequential(*map(plain, agent.decoder.network))
+
+    def loss(self, pixels: Tensor) -> Tensor:
+        images = pixels.float() / 255.0
+        loc, log_scale = self.head(self.convolutions(images)).chunk(2, -1)
+        scale = log_scale.exp()
+        made = self.decoder(loc + scale * torch.randn_like(loc))
+        divergence = 0.5 * (loc.square() + scale.square() - 2 * log_scale - 1).mean()
+        return (made - images).square().mean() + 1e-6 * divergence
+
+
+def vae(bench: Bench, preset: DictConfig, frames: Tensor, device: torch.device, *, plain: bool) -> None:
+    """VAE steps at batch 256 and at the preset's, and encoding."""
+    agent = LS3Agent(2, in_channels=frames.shape[1], **preset.agent).to(device)
+    slow = _PlainVAE(agent).to(device)
+    for half in (agent.encoder, agent.decoder):
+        half.to(memory_format=torch.channels_last)
+    loss = VAELoss(agent.encoder, agent.decoder)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-4, fused=True)
+    plain_optimizer = torch.optim.Adam(slow.parameters(), lr=1e-4)
+
+    for batch in sorted({256, preset.vae.batch_size}):
+        pixels = frames[torch.randint(len(frames), (batch,))].to(device)
+
+        def fast_step(pixels: Tensor = pixels, *, autocast: bool = False) -> None:
+            with torch.autocast(device.type, torch.bfloat16, enabled=autocast):
+                value = loss(TensorDict({"pixels": pixels}, [len(pixels)]))["loss_vae"]
+            optimizer.zero_grad()
+            value.backward()
+            optimizer.step()
+
+        def plain_step(pixels: Tensor = pixels) -> None:
+            value = slow.loss(pixels)
+            plain_optimizer.zero_grad()
+            value.backward()
+            plain_optimizer.step()
+
+        base = f"VAE step of {batch}, plain"
+        if plain:
+            bench.time(base, plain_step)
+        bench.time(f"VAE step of {batch}, fp32", fast_step, against=base)
+        bench.time(f"VAE step of {batch}, bf16", lambda: fast_step(autocast=True), against=base)
+    pixels = frames[:512].to(device)
+    with torch.no_grad():
+        encode = TensorDict({"pixels": pixels}, [len(pixels)])
+        bench.time("encoding a frame", lambda: agent.encoder(encode), per=len(pixels))
+
+
+def run(config: DictConfig) -> dict:
+    """Run the benchmark.
+
+    Args:
+        config: the resolved configuration of ``conf/benchmark.yaml``.
+
+    Returns:
+        What is written to ``benchmark.json``.
+    """
+    device = choose_device(config.device)
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    presets = [compose("ls3", [f"task={config.task}", f"preset={name}"]) for name in config.presets]
+    folder = RunFolder(config.output, config)
+    bench = Bench(config.seconds)
+    peaks = {str(t).removeprefix("torch."): matmul_peak(bench, t, device) for t in (torch.float32, torch.bfloat16)}
+
+    env = ls3_envs.make(config.task, num_worlds=1, seed=0)
+    spec = env.action_spec
+    flat = Bounded(low=spec.space.low[0], high=spec.space.high[0], shape=spec.shape[1:], device=device)
+    for preset in presets:
+        plans(bench, preset, flat, config.batches, device, plain=config.plain)
+        updates(bench, preset, flat.shape[-1], device, plain=config.plain)
+    episodes = ls3_envs.collect_offline(config.task, "success", episodes=8, seed=0)
+    vae(bench, presets[0], episodes["pixels"].flatten(0, 1), device, plain=config.plain)
+    for worlds in config.batches:
+        env = ls3_envs.make(config.task, num_worlds=worlds, seed=0)
+        td = env.rand_action(env.reset())
+        bench.time(f"environment step with pixels, each of {worlds}", lambda: env.step(td), per=worlds)  # noqa: B023
+    buffer = TaggedReplayBuffer(2000, latent_dim=presets[0].agent.latent_dim)
+    buffer.add(episodes, Tag.SUCCESS)
+    buffer.encode(LS3Agent(flat.shape[-1], **presets[0].agent).encoder)
+    bench.time("sampling 256 transitions for each of 5 members", lambda: buffer.sample(256, members=5))
+
+    for row in bench.rows:
+        if "gflops" in row:
+            peak = peaks["bfloat16" if row["what"].endswith("bf16") else "float32"] / 1e9
+            row["share_of_peak"] = row["gflops"] / peak
+    out = {
+        "hardware": hardware(device),
+        "peak_gflops": {name: peak / 1e9 for name, peak in peaks.items()},
+        "rows": bench.rows,
+    }
+    folder.write_json("benchmark.json", out)
+    folder.close()
+    show(bench.rows, Path(config.output))
+    return out
+
+
+def show(rows: list[dict[str, Any]], folder: Path) -> None:
+    """The final table."""
+    table = Table(title="Benchmark")
+    for column in ("", "median", "spread", "runs", "times faster than plain", "share of peak"):
+        table.add_column(column, justify="left" if not column else "right")
+    for row in rows:
+        digits = max(0, 2 - math.floor(math.log10(max(row["median_ms"], 1e-9))))
+        table.add_row(
+            row["what"],
+            f"{row['median_ms']:.{digits}f} ms",
+            f"{row['iqr_ms']:.{digits}f}",
+            str(row["runs"]),
+            f"{row['times_faster']:.1f}" if "times_faster" in row else "",
+            f"{row['share_of_peak']:.0%}" if "share_of_peak" in row else "",
+        )
+    console.print(table)
+    console.print(f"benchmark.json is in [bold]{folder}[/bold]")
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="benchmark")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    OmegaConf.resolve(config)
+    run(config)
+
+
+if __name__ == "__main__":
+    main()
