@@ -1,0 +1,61 @@
+"""The benchmark runs, writes what it measured, and counts operations as they are."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from torch import nn
+from torchrl.data import Bounded
+
+import benchmark
+from ls3_torchrl import LS3Agent
+
+
+def test_the_benchmark_writes_its_figures_and_ratios(tmp_path):
+    out = tmp_path / "bench"
+    settings = ["presets=[smoke]", "batches=[1,2]", "seconds=0.01", "device=cpu", f"output={out}"]
+    with initialize_config_dir(str(Path(benchmark.__file__).parent / "conf"), version_base="1.3"):
+        benchmark.run(compose("benchmark", settings))
+    written = json.loads((out / "benchmark.json").read_text())
+    rows = {row["what"]: row for row in written["rows"]}
+    assert all(row["median_ms"] > 0 and row["runs"] >= 1 for row in rows.values())
+    for figure in (
+        "plan, smoke, fp32",
+        "plan, smoke, auto, each of 2",
+        "dynamics step, smoke",
+        "VAE step of 256, fp32",
+    ):
+        row = rows[figure]
+        assert row["times_faster"] == pytest.approx(rows[row["against"]]["median_ms"] / row["median_ms"])
+    assert rows["plan, smoke, fp32"]["share_of_peak"] > 0
+    assert "environment step with pixels, each of 2" in rows
+
+
+def test_operations_of_a_plan_by_hand():
+    agent = LS3Agent(2, latent_dim=3, dynamics_hidden=[4], value_hidden=[5], classifier_hidden=[6], num_values=7)
+    options = {"num_candidates": 11, "num_particles": 2, "optim_steps": 3, "horizon": 5}
+    dynamics, head, value = (3 + 2) * 4 + 4 * 6, 3 * 6 + 6 * 1, 3 * 5 + 5 * 1
+    by_hand = 2 * 11 * 2 * 3 * (5 * (dynamics + 2 * head) + head + 7 * value)
+    assert benchmark.plan_flops(agent, options) == by_hand
+
+
+def test_every_plan_of_a_permissive_agent_is_feasible():
+    torch.manual_seed(0)
+    agent = benchmark.permissive(LS3Agent(2, latent_dim=4))
+    planner = agent.planner(Bounded(low=-1.0, high=1.0, shape=(2,)), num_candidates=20, num_elites=2, num_particles=2)
+    result = planner.plan(torch.randn(3, 4))
+    assert not result.fallback.any()
+    assert result.populations.tolist() == [4, 4, 4]
+
+
+def test_the_plain_vae_has_the_layers_of_the_agents():
+    agent = LS3Agent(2, latent_dim=4)
+    plain = benchmark._PlainVAE(agent)
+    assert sum(p.numel() for p in plain.parameters()) == sum(
+        p.numel() for half in (agent.encoder, agent.decoder) for p in half.parameters()
+    )
+    kinds = {type(layer) for layer in plain.modules() if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d))}
+    assert kinds == {nn.Conv2d, nn.ConvTranspose2d}
+    assert plain.loss(torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).isfinite()
