@@ -245,7 +245,8 @@ def plans(
 ) -> None:
     """Random candidate plans at moments of one episode: feasible or not, and the plan that was chosen.
 
-    Positions are those that the true, noiseless world would reach under the planned actions.
+    Positions are those that the true, noiseless world would reach under the planned actions; the pale line is the
+    whole episode.
     """
     plane = env.plane()
     assert plane is not None
@@ -268,9 +269,11 @@ def plans(
             axis.plot(*_line(track), color=SAFE if allowed else UNSAFE, lw=0.5, alpha=0.45)
         track = torch.cat([state[None], state + chosen[0].cpu().cumsum(0)])
         axis.plot(*_line(track), color=INK, lw=2.2)
+        axis.plot(*_line(episode["next", "state"]), color=PALE, lw=2.2, zorder=0)
+        axis.plot(*state.tolist(), "o", color=INK, ms=5)
         _wall(axis, extent)
         centre = state.tolist()
-        axis.set(xlim=(centre[0] - 35, centre[0] + 35), ylim=(centre[1] + 30, centre[1] - 30))
+        axis.set(xlim=(centre[0] - 54, centre[0] + 54), ylim=(centre[1] + 45, centre[1] - 45))
         axis.set_title(f"step {t}: {verdict.feasible.float().mean():.0%} feasible")
     figure.savefig(folder / "plans.png")
     plt.close(figure)
