@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -34,7 +35,19 @@ def test_make_targets_exist():
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
 
 
+@pytest.mark.parametrize("name", ["docs/deviations.md", "docs/learning.md", "README.md"])
+def test_settings_that_the_documents_name_exist(name):
+    with initialize_config_dir(str(ROOT / "recipes" / "conf"), version_base="1.3"):
+        config = compose("ls3", [])
+    groups = "agent|vae|offline|online|optim|loss|planner|evaluation"
+    named = re.findall(rf"`(?:[^`]* )?((?:{groups})\.[a-z_]+)", (ROOT / name).read_text())
+    named = [key for key in named if key.split(".")[1] not in ("pt", "py", "gif")]
+    missing = {key for key in named if OmegaConf.select(config, key, default=...) is ...}
+    assert not missing
+
+
 def test_files_that_the_documents_link_to_exist():
-    for document in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "docs" / "deviations.md"):
+    documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
+    for document in documents:
         for link in re.findall(r"\]\((?!http)([^)#]+)\)", document.read_text()):
             assert (document.parent / link).exists(), f"{document.name}: {link}"

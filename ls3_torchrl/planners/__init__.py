@@ -2,10 +2,11 @@
 
 from ls3_torchrl.planners.cem import CEMResult, CrossEntropyMethod, Judgement
 from ls3_torchrl.planners.fused import FusedImagination
-from ls3_torchrl.planners.imagination import ImaginationNoise, RolloutImagination
+from ls3_torchrl.planners.imagination import ImaginationNoise, Limits, PlanNoise, RolloutImagination
 from ls3_torchrl.planners.latent_env import LatentEnv
-from ls3_torchrl.planners.ls3 import LS3Planner, PlanNoise, describe_plan
+from ls3_torchrl.planners.ls3 import LS3Planner, describe_plan
 from ls3_torchrl.planners.scoring import PlanStatistics, feasible, least_harm, objective
+from ls3_torchrl.planners.warm_start import WarmStart
 
 __all__ = [
     "CEMResult",
@@ -15,9 +16,11 @@ __all__ = [
     "Judgement",
     "LS3Planner",
     "LatentEnv",
+    "Limits",
     "PlanNoise",
     "PlanStatistics",
     "RolloutImagination",
+    "WarmStart",
     "describe_plan",
     "feasible",
     "least_harm",

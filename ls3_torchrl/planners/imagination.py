@@ -27,6 +27,27 @@ class ImaginationNoise(NamedTuple):
     noise: Tensor
 
 
+class PlanNoise(NamedTuple):
+    """All randomness of a plan over K populations, for plans that must be repeatable.
+
+    Attributes:
+        normal: candidates' Gaussian noise ``[K, B, N, H, A]``.
+        uniform: candidates' uniform noise in [0, 1) ``[K, B, N, H, A]``.
+        members: dynamics members ``[K, H, P]``.
+        dynamics: dynamics noise ``[K, B, H, P, N or 1, D]``.
+    """
+
+    normal: Tensor
+    uniform: Tensor
+    members: Tensor
+    dynamics: Tensor
+
+    def row(self, index: int) -> PlanNoise:
+        """The noise of one batch row, as a batch of one."""
+        one = slice(index, index + 1)
+        return PlanNoise(self.normal[:, one], self.uniform[:, one], self.members, self.dynamics[:, one])
+
+
 class Limits(NamedTuple):
     """What makes a plan feasible.
 

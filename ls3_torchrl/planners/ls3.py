@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import InteractionType, TensorDictModuleBase, set_interaction_type
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules.planners import MPCPlannerBase
 
@@ -27,6 +26,7 @@ from ls3_torchrl.planners.imagination import (
     Imagination,
     ImaginationNoise,
     Limits,
+    PlanNoise,
     RolloutImagination,
     draw_members,
 )
@@ -39,29 +39,9 @@ from ls3_torchrl.planners.scoring import (
     least_harm,
     objective,
 )
+from ls3_torchrl.planners.warm_start import WarmStart
 
 Engine = Literal["auto", "fused", "rollout"]
-
-
-class PlanNoise(NamedTuple):
-    """All randomness of a plan over K populations, for plans that must be repeatable.
-
-    Attributes:
-        normal: candidates' Gaussian noise ``[K, B, N, H, A]``.
-        uniform: candidates' uniform noise in [0, 1) ``[K, B, N, H, A]``.
-        members: dynamics members ``[K, H, P]``.
-        dynamics: dynamics noise ``[K, B, H, P, N or 1, D]``.
-    """
-
-    normal: Tensor
-    uniform: Tensor
-    members: Tensor
-    dynamics: Tensor
-
-    def row(self, index: int) -> PlanNoise:
-        """The noise of one batch row, as a batch of one."""
-        one = slice(index, index + 1)
-        return PlanNoise(self.normal[:, one], self.uniform[:, one], self.members, self.dynamics[:, one])
 
 
 class LS3Planner(MPCPlannerBase):
@@ -201,7 +181,9 @@ class LS3Planner(MPCPlannerBase):
         else:
             self.imagine = RolloutImagination(env, value, safe_set, **reductions)
         self.action_key, self.latent_key = action_key, latent_key
-        self.plan_key, self.is_init_key = plan_key, is_init_key
+        self.plan_key = plan_key
+        space = self.action_spec.space
+        self.warm_start = WarmStart(space.low, space.high, horizon, plan_key, is_init_key)
         self.in_keys = [latent_key] if encoder is None else list(encoder.in_keys)
         self.out_keys = [action_key, *(self._plan(name) for name in _DECISIONS)]
 
@@ -210,12 +192,7 @@ class LS3Planner(MPCPlannerBase):
 
     def primer(self) -> TensorDictPrimer:
         """The transform that carries the warm start from step to step and resets it with the episode."""
-        shape = (self.horizon, self.action_spec.shape[-1])
-        spec = Composite()
-        for name in ("mean", "std"):
-            spec[self._plan(name)] = Unbounded(shape=shape, device=self.action_spec.device)
-        # Zeros: a warm start without any spread is none (a shifted plan always has some at its open end).
-        return TensorDictPrimer(spec, default_value=0.0, expand_specs=True)
+        return self.warm_start.primer()
 
     def draw_noise(self, batch: int) -> PlanNoise:
         """All noise that a plan for ``batch`` rows can need; large, meant for tests and comparisons."""
@@ -303,21 +280,6 @@ class LS3Planner(MPCPlannerBase):
     def _threshold(self, restarts: Tensor) -> Tensor:
         return self.safe_set_threshold * self.relaxation ** restarts.to(torch.float32)
 
-    def _warm_start(self, tensordict: TensorDictBase, rows: int) -> tuple[Tensor | None, Tensor | None]:
-        mean, std = (tensordict.get(self._plan(name), None) for name in ("mean", "std"))
-        if mean is None or std is None:
-            return None, None
-        space = self.action_spec.space
-        middle, wide = (space.low + space.high) / 2, (space.high - space.low) / 4
-        mean = mean.reshape(rows, *mean.shape[-2:])
-        std = std.reshape(rows, *std.shape[-2:])
-        is_init = tensordict.get(self.is_init_key, None)
-        fresh = (std == 0).all(-1, keepdim=True).all(-2, keepdim=True)
-        if is_init is not None:
-            fresh = fresh | is_init.reshape(rows, 1, 1)
-        mean, std = torch.where(fresh, middle, mean), torch.where(fresh, wide, std)
-        return mean, std
-
     def planning(self, td: TensorDictBase, noise: PlanNoise | None = None) -> Tensor:
         """The actions ``[*B, A]`` alone, as TorchRL's planners return them."""
         return self(td.copy(), noise=noise).get(self.action_key)
@@ -334,11 +296,9 @@ class LS3Planner(MPCPlannerBase):
         latent = self.encode(tensordict)
         batch = latent.shape[:-1]
         rows = batch.numel()
-        mean, std = self._warm_start(tensordict, rows)
+        mean, std = self.warm_start.read(tensordict, rows)
         result = self.plan(latent.reshape(rows, -1), mean, std, noise)
 
-        space = self.action_spec.space
-        middle, wide = (space.low + space.high) / 2, (space.high - space.low) / 4
         decisions = {
             "feasible": ~result.fallback,
             "fallback": result.fallback,
@@ -349,13 +309,7 @@ class LS3Planner(MPCPlannerBase):
         out.set(self.action_key, result.actions[:, 0].reshape(*batch, -1))
         for name, value in decisions.items():
             out.set(self._plan(name), value.reshape(*batch, 1))
-        # One step on, the plan is one action shorter: shift it and widen the open end.
-        shifted = {
-            "mean": torch.cat([result.mean[:, 1:], middle.expand(rows, 1, -1)], 1),
-            "std": torch.cat([result.std[:, 1:], wide.expand(rows, 1, -1)], 1),
-        }
-        for name, value in shifted.items():
-            out.set(unravel_key(("next", self._plan(name))), value.reshape(*batch, *value.shape[1:]))
+        self.warm_start.write(out, result.mean, result.std)
         return out
 
     def statistics(self, latent: Tensor, actions: Tensor) -> PlanStatistics:
