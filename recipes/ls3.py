@@ -35,9 +35,15 @@ def seeds(seed: int) -> dict[str, int]:
     return {name: 10_000 * seed + 1_000 * i for i, name in enumerate(names)}
 
 
-def _read(probe: StateProbe, episodes: TensorDictBase, horizon: int) -> dict[str, float]:
-    imagined = probe.imagination_error(episodes, horizon=horizon)
-    return {"state_error": round(probe.error, 3), f"imagined_{horizon}_steps_error": round(imagined, 3)}
+def probe(agent: LS3Agent, offline: list[TensorDictBase], evaluation: TensorDictBase, horizon: int) -> dict[str, float]:
+    """How well latents and imagination know the simulator's state, where the episodes keep it; else nothing."""
+    episodes = [*offline, evaluation]
+    if any(part.get("state", None) is None for part in episodes):
+        return {}
+    latents = StateProbe(agent, offline)
+    # What was imagined on the agent's own way is read by a probe that has seen the way.
+    imagined = StateProbe(agent, episodes).imagination_error(evaluation, horizon=horizon)
+    return {"state_error": round(latents.error, 3), f"imagined_{horizon}_steps_error": round(imagined, 3)}
 
 
 def train(config: DictConfig) -> dict:
@@ -90,9 +96,6 @@ def train(config: DictConfig) -> dict:
     training = Training(agent, buffer, config, run)
     with timed(seconds, "vae"):
         training.train_vae()
-    # The simulator's state, where it is known, tells how well latents and dynamics see; nothing learns from it.
-    known = all(episodes.get("state", None) is not None for episodes in offline.values())
-    probe = StateProbe(agent, offline) if known else None
     with timed(seconds, "offline"):
         training.train_offline()
     agent.save(run.path / "checkpoints" / "agent_000.pt")
@@ -145,7 +148,7 @@ def train(config: DictConfig) -> dict:
         "seed": config.seed,
         "minutes": 0.0,
         "demonstrations": summarise(demonstrations),
-        **({} if probe is None else {"probe": _read(probe, evaluation, config.planner.horizon)}),
+        "probe": probe(agent, list(offline.values()), evaluation, config.planner.horizon),
         **({"online": summarise(online)} if online else {}),
         "evaluation": summarise([episode_figures(evaluation)]),
         "hardware": hardware(device),

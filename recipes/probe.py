@@ -2,69 +2,72 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from ls3_torchrl import LS3Agent
-from ls3_torchrl.data import Tag
-
-
-def kernel_ridge(x: Tensor, y: Tensor, *, ridge: float = 1e-5) -> tuple[Tensor, Tensor, float]:
-    """Fit y ≈ k(·, x) w + mean(y) with a Gaussian kernel half as wide as the median distance between inputs.
-
-    Args:
-        x: inputs ``[n, D]``.
-        y: targets ``[n, S]``.
-        ridge: added to the kernel's diagonal.
-
-    Returns:
-        Weights ``[n, S]``, offset ``[S]`` and the kernel's width.
-    """
-    distance = torch.cdist(x, x)
-    width = 0.5 * float(distance[torch.triu(torch.ones_like(distance, dtype=torch.bool), 1)].median())
-    kernel = (-0.5 * (distance / width).square()).exp()
-    offset = y.mean(0)
-    weights = torch.linalg.solve(kernel + ridge * torch.eye(len(x), dtype=x.dtype), y - offset)
-    return weights, offset, width
+from training import threads
 
 
 class StateProbe:
-    """Reads the simulator's state from latents: kernel ridge regression on the posteriors' means of offline frames.
+    """Reads the simulator's state from latents: a small network on the posteriors' means of episodes' frames.
 
     It learns from four fifths of the frames, drawn at random; ``error`` is its mean distance from the true state on
-    the rest, in units of the state.
+    the rest, in units of the state. Nothing that LS³ learns sees it.
 
     Args:
         agent: with a trained encoder.
-        offline: episodes ``[N, T]`` by tag, with ``state``.
+        episodes: ``[N, T]`` each, with ``pixels`` and ``state``.
         frames: at most so many are used.
+        steps: gradient steps.
 
     Raises:
         KeyError: where episodes keep no ``state``.
     """
 
-    @torch.no_grad()
-    def __init__(self, agent: LS3Agent, offline: dict[Tag, TensorDictBase], *, frames: int = 4000) -> None:
+    def __init__(
+        self, agent: LS3Agent, episodes: Iterable[TensorDictBase], *, frames: int = 10_000, steps: int = 3000
+    ) -> None:
         self.agent = agent
-        pixels, state = (torch.cat([e[k].flatten(0, 1) for e in offline.values()]) for k in ("pixels", "state"))
-        chosen = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))[:frames]
-        latent, state = self.encode(pixels[chosen]).double(), state[chosen].double()
+        episodes = list(episodes)
+        pixels, state = (torch.cat([e[k].flatten(0, 1) for e in episodes]) for k in ("pixels", "state"))
+        generator = torch.Generator().manual_seed(0)
+        chosen = torch.randperm(len(pixels), generator=generator)[:frames]
+        latent, state = self.encode(pixels[chosen]), state[chosen].float().cpu()
         test, train = slice(0, len(chosen) // 5), slice(len(chosen) // 5, None)
-        self._seen = latent[train]
-        self._weights, self._offset, self._width = kernel_ridge(self._seen, state[train])
+        self._latent = latent.mean(0), latent.std(0).clamp(min=1e-6)
+        self._state = state.mean(0), state.std()
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            self._network = MLP(latent.shape[1], state.shape[1], num_cells=[128, 128], activation_class=nn.ReLU)
+        optimizer = torch.optim.Adam(self._network.parameters(), lr=3e-3)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=steps, pct_start=0.05)
+        x, y = latent[train], (state[train] - self._state[0]) / self._state[1]
+        with threads(1):
+            for _ in range(steps):
+                rows = torch.randint(len(x), (256,), generator=generator)
+                loss = (self._network((x[rows] - self._latent[0]) / self._latent[1]) - y[rows]).square().mean()
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+                schedule.step()
         self.error = float((self.read(latent[test]) - state[test]).norm(dim=-1).mean())
 
+    @torch.no_grad()
     def encode(self, pixels: Tensor) -> Tensor:
         """Posterior means ``[n, D]`` of images ``[n, C, 64, 64]``."""
         device = next(self.agent.parameters()).device
         parts = (self.agent.encoder[0](TensorDict({"pixels": p.to(device)}, [len(p)])) for p in pixels.split(512))
         return torch.cat([part["loc"].cpu() for part in parts])
 
+    @torch.no_grad()
     def read(self, latent: Tensor) -> Tensor:
         """States ``[n, S]`` of latents ``[n, D]``."""
-        distance = torch.cdist(latent.double(), self._seen)
-        return (-0.5 * (distance / self._width).square()).exp() @ self._weights + self._offset
+        return self._network((latent - self._latent[0]) / self._latent[1]) * self._state[1] + self._state[0]
 
     @torch.no_grad()
     def imagination_error(self, episodes: TensorDictBase, *, horizon: int, stride: int = 5) -> float:
@@ -85,5 +88,5 @@ class StateProbe:
         for step in range(horizon):
             action = episodes["action"][:, starts + step].flatten(0, 1).to(device)
             latent = dynamics.distribution(latent, action)[0].mean(-2)
-        reached = episodes["next", "state"][:, starts + horizon - 1].flatten(0, 1)
+        reached = episodes["next", "state"][:, starts + horizon - 1].flatten(0, 1).cpu()
         return float((self.read(latent.cpu()) - reached).norm(dim=-1).mean())
