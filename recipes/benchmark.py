@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -12,69 +11,21 @@ import hydra
 import torch
 from hydra import compose
 from omegaconf import DictConfig, OmegaConf
-from rich.table import Table
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torch.utils.benchmark import Timer
 from torchrl.data import Bounded
 from torchrl.objectives import HardUpdate
 
 import ls3_envs
-from common import RunFolder, choose_device, console, hardware
+from common import RunFolder, choose_device, hardware
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.modules.ensemble import EnsembleMLP
 from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, VAELoss
 from ls3_torchrl.planners import LS3Planner
-
-
-class Bench:
-    """Collects figures.
-
-    Args:
-        seconds: at least so long is measured for each figure.
-    """
-
-    def __init__(self, seconds: float) -> None:
-        self.seconds = seconds
-        self.rows: list[dict[str, Any]] = []
-
-    def time(self, what: str, call: Callable[[], object], *, per: int = 1, against: str | None = None) -> float:
-        """Time ``call``.
-
-        Args:
-            what: the figure's name.
-            call: what is timed.
-            per: how many things one call does; the figure is of one.
-            against: name of an earlier figure that this one is compared to.
-
-        Returns:
-            The median, in seconds, of one thing.
-        """
-        call()
-        timer = Timer("call()", globals={"call": call}, num_threads=torch.get_num_threads())
-        found = timer.blocked_autorange(min_run_time=self.seconds)
-        median = found.median / per
-        earlier = {row["what"]: row["median_ms"] for row in self.rows}
-        row: dict[str, Any] = {
-            "what": what,
-            "median_ms": 1e3 * median,
-            "iqr_ms": 1e3 * found.iqr / per,
-            "runs": len(found.times),
-        }
-        if against is not None and against in earlier:
-            row |= {"against": against, "times_faster": earlier[against] / row["median_ms"]}
-        self.rows.append(row)
-        faster = f"  {row['times_faster']:.1f} times faster than {against}" if "times_faster" in row else ""
-        console.print(f"{what:<46}{row['median_ms']:10.3f} ms{faster}")
-        return median
-
-
-def matmul_peak(bench: Bench, dtype: torch.dtype, device: torch.device, size: int = 2048) -> float:
-    """The most FLOP/s that a square product reaches here."""
-    a, b = (torch.randn(size, size, device=device).to(dtype) for _ in range(2))
-    name = str(dtype).removeprefix("torch.")
-    return 2 * size**3 / bench.time(f"product of {size} x {size}, {name}", lambda: a @ b)
+from plain import PlainVAE, plain_members
+from timing import Bench, matmul_peak, show
+from training import threads
 
 
 def permissive(agent: LS3Agent) -> LS3Agent:
@@ -133,20 +84,11 @@ def plans(
             bench.time(figure, plan(planner(), batch), per=batch, against=base)
 
 
-def _plain_members(sizes: Sequence[int], count: int) -> list[nn.Sequential]:
-    return [
-        nn.Sequential(*(layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU())))[:-1]
-        for _ in range(count)
-    ]
-
-
 def updates(bench: Bench, preset: DictConfig, action_dim: int, device: torch.device, *, plain: bool) -> None:
     """Gradient steps of a preset's losses; dynamics and values also as a loop over members."""
     agent = LS3Agent(action_dim, **preset.agent).to(device)
     batch, d, name = preset.optim.batch_size, preset.agent.latent_dim, preset.preset
     members = agent.value.num_members
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # as the recipes do
 
     def tensors(*shape: int) -> TensorDict:
         data = {"latent": torch.randn(*shape, d), "action": torch.randn(*shape, action_dim)}
@@ -165,12 +107,12 @@ def updates(bench: Bench, preset: DictConfig, action_dim: int, device: torch.dev
         return take
 
     def loop(sizes: Sequence[int], inputs: Tensor, error: Callable[[Tensor, int], Tensor]) -> Callable[[], object]:
-        networks = _plain_members(sizes, members)
+        networks = [network.to(device) for network in plain_members(sizes, members)]
         optimizers = [torch.optim.Adam(network.parameters(), lr=1e-4) for network in networks]
 
         def take() -> None:
             for m, (network, optimizer) in enumerate(zip(networks, optimizers, strict=True)):
-                value = error(network.to(device)(inputs[:, m]), m)
+                value = error(network(inputs[:, m]), m)
                 optimizer.zero_grad()
                 value.backward()
                 optimizer.step()
@@ -205,40 +147,12 @@ def updates(bench: Bench, preset: DictConfig, action_dim: int, device: torch.dev
         step(safe_set, "loss_safe_set", tensors(batch)),
     )
     bench.time(f"safe set step, {name}", lambda: (take(), target.step()))
-    torch.set_num_threads(threads)
-
-
-class _PlainVAE(nn.Module):
-    """The VAE's layers in eager PyTorch with nothing done for speed."""
-
-    def __init__(self, agent: LS3Agent) -> None:
-        super().__init__()
-
-        def plain(layer: nn.Module) -> nn.Module:
-            for kind in (nn.Conv2d, nn.ConvTranspose2d):
-                if isinstance(layer, kind):
-                    (kernel, _), (stride, _) = layer.kernel_size, layer.stride
-                    return kind(layer.in_channels, layer.out_channels, kernel, stride)
-            return layer
-
-        posterior = next(m for m in agent.encoder.modules() if hasattr(m, "convolutions"))
-        self.convolutions = nn.Sequential(*map(plain, posterior.convolutions))
-        self.head = nn.Linear(256, 2 * agent.encoder.latent_dim)
-        self.decoder = nn.Sequential(*map(plain, agent.decoder.network))
-
-    def loss(self, pixels: Tensor) -> Tensor:
-        images = pixels.float() / 255.0
-        loc, log_scale = self.head(self.convolutions(images)).chunk(2, -1)
-        scale = log_scale.exp()
-        made = self.decoder(loc + scale * torch.randn_like(loc))
-        divergence = 0.5 * (loc.square() + scale.square() - 2 * log_scale - 1).mean()
-        return (made - images).square().mean() + 1e-6 * divergence
 
 
 def vae(bench: Bench, preset: DictConfig, frames: Tensor, device: torch.device, *, plain: bool) -> None:
     """VAE steps at batch 256 and at the preset's, and encoding."""
     agent = LS3Agent(2, in_channels=frames.shape[1], **preset.agent).to(device)
-    slow = _PlainVAE(agent).to(device)
+    slow = PlainVAE(agent).to(device)
     for half in (agent.encoder, agent.decoder):
         half.to(memory_format=torch.channels_last)
     loss = VAELoss(agent.encoder, agent.decoder)
@@ -294,7 +208,8 @@ def run(config: DictConfig) -> dict:
     flat = Bounded(low=spec.space.low[0], high=spec.space.high[0], shape=spec.shape[1:], device=device)
     for preset in presets:
         plans(bench, preset, flat, config.batches, device, plain=config.plain)
-        updates(bench, preset, flat.shape[-1], device, plain=config.plain)
+        with threads(1):  # as the recipes do
+            updates(bench, preset, flat.shape[-1], device, plain=config.plain)
     episodes = ls3_envs.collect_offline(config.task, "success", episodes=8, seed=0)
     vae(bench, presets[0], episodes["pixels"].flatten(0, 1), device, plain=config.plain)
     for worlds in config.batches:
@@ -319,25 +234,6 @@ def run(config: DictConfig) -> dict:
     folder.close()
     show(bench.rows, Path(config.output))
     return out
-
-
-def show(rows: list[dict[str, Any]], folder: Path) -> None:
-    """The final table."""
-    table = Table(title="Benchmark")
-    for column in ("", "median", "spread", "runs", "times faster than plain", "share of peak"):
-        table.add_column(column, justify="left" if not column else "right")
-    for row in rows:
-        digits = max(0, 2 - math.floor(math.log10(max(row["median_ms"], 1e-9))))
-        table.add_row(
-            row["what"],
-            f"{row['median_ms']:.{digits}f} ms",
-            f"{row['iqr_ms']:.{digits}f}",
-            str(row["runs"]),
-            f"{row['times_faster']:.1f}" if "times_faster" in row else "",
-            f"{row['share_of_peak']:.0%}" if "share_of_peak" in row else "",
-        )
-    console.print(table)
-    console.print(f"benchmark.json is in [bold]{folder}[/bold]")
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="benchmark")

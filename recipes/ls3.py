@@ -36,9 +36,9 @@ def seeds(seed: int) -> dict[str, int]:
 
 
 def probe(agent: LS3Agent, offline: list[TensorDictBase], evaluation: TensorDictBase, horizon: int) -> dict[str, float]:
-    """How well latents and imagination know the simulator's state, where the episodes keep it; else nothing."""
+    """How well latents and imagination know the simulator's state, where the episodes keep it (and are long enough)."""
     episodes = [*offline, evaluation]
-    if any(part.get("state", None) is None for part in episodes):
+    if any(part.get("state", None) is None for part in episodes) or evaluation.shape[1] < horizon:
         return {}
     latents = StateProbe(agent, offline)
     # What was imagined on the agent's own way is read by a probe that has seen the way.
@@ -142,13 +142,15 @@ def train(config: DictConfig) -> dict:
         evaluation = run_episodes(
             config, planner, config.evaluation.episodes, seed["evaluation"], device, what="Evaluation"
         )
+    with timed(seconds, "probe"):
+        probed = probe(agent, list(offline.values()), evaluation, config.planner.horizon)
     summary = {
         "task": config.task.name,
         "preset": config.preset,
         "seed": config.seed,
         "minutes": 0.0,
         "demonstrations": summarise(demonstrations),
-        "probe": probe(agent, list(offline.values()), evaluation, config.planner.horizon),
+        "probe": probed,
         **({"online": summarise(online)} if online else {}),
         "evaluation": summarise([episode_figures(evaluation)]),
         "hardware": hardware(device),

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from common import progress
 from ls3_torchrl import LS3Agent
 from training import threads
 
@@ -47,7 +48,7 @@ class StateProbe:
         optimizer = torch.optim.Adam(self._network.parameters(), lr=3e-3)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=steps, pct_start=0.05)
         x, y = latent[train], (state[train] - self._state[0]) / self._state[1]
-        with threads(1):
+        with threads(1), progress(steps, "Probe") as bar:
             for _ in range(steps):
                 rows = torch.randint(len(x), (256,), generator=generator)
                 loss = (self._network((x[rows] - self._latent[0]) / self._latent[1]) - y[rows]).square().mean()
@@ -55,6 +56,7 @@ class StateProbe:
                 loss.backward()
                 optimizer.step()
                 schedule.step()
+                bar.update()
         self.error = float((self.read(latent[test]) - state[test]).norm(dim=-1).mean())
 
     @torch.no_grad()
@@ -80,7 +82,12 @@ class StateProbe:
             episodes: ``[N, T]`` with ``pixels``, ``action`` and ``("next", "state")``.
             horizon: H, imagined steps.
             stride: between starts.
+
+        Raises:
+            ValueError: for episodes of fewer steps than H.
         """
+        if episodes.shape[1] < horizon:
+            raise ValueError(f"Episodes of {episodes.shape[1]} steps are too short to imagine {horizon} of them.")
         dynamics = self.agent.dynamics
         device = next(self.agent.parameters()).device
         starts = torch.arange(0, episodes.shape[1] - horizon + 1, stride)

@@ -107,7 +107,7 @@ class TD1ValueLoss(LossModule):
         zero_at_goal: the target is 0 where the reward is 0, since the agent may stay in the goal set; this is
             what the authors' code does.
         monte_carlo: the target is at least the return that was seen, max(r_t + γ V_θ'(z_{t+1}), Σ_{i≥0} γ^i r_{t+i}),
-            as in MCAC (Wilcox et al. 2022, arXiv 2210.07432, equation (1)). A return that was reached once bounds the
+            as MCAC does for Q (Wilcox et al. 2022, arXiv 2210.07432). A return that was reached once bounds the
             value of acting well from below, so that failures nearby do not wash out what demonstrations have shown.
             The labels of failed episodes must not end with the horizon
             (``TaggedReplayBuffer(continue_failures=True)``). ``False`` is the paper.

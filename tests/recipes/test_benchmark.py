@@ -11,6 +11,7 @@ from torchrl.data import Bounded
 
 import benchmark
 from ls3_torchrl import LS3Agent
+from plain import PlainVAE
 
 
 def test_the_benchmark_writes_its_figures_and_ratios(tmp_path):
@@ -52,7 +53,7 @@ def test_every_plan_of_a_permissive_agent_is_feasible():
 
 def test_the_plain_vae_has_the_layers_of_the_agents():
     agent = LS3Agent(2, latent_dim=4)
-    plain = benchmark._PlainVAE(agent)
+    plain = PlainVAE(agent)
     assert sum(p.numel() for p in plain.parameters()) == sum(
         p.numel() for half in (agent.encoder, agent.decoder) for p in half.parameters()
     )

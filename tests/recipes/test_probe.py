@@ -75,3 +75,19 @@ def test_without_states_there_is_nothing_to_probe():
     episodes = TensorDict({"pixels": torch.zeros(2, 3, 3, 64, 64, dtype=torch.uint8)}, [2, 3])
     with pytest.raises(KeyError, match="state"):
         StateProbe(LS3Agent(action_dim=2, latent_dim=4), [episodes])
+
+
+def test_episodes_shorter_than_what_is_imagined_are_refused():
+    episodes = walks(2)
+    probe = StateProbe(agent_with(Reader(False), Mover(1.0)), [episodes], steps=2)
+    with pytest.raises(ValueError, match="2 steps are too short to imagine 3"):
+        probe.imagination_error(episodes, horizon=3)
+
+
+def test_a_run_without_states_or_with_short_episodes_is_summarised_without_a_probe():
+    import ls3
+
+    agent, episodes = agent_with(Reader(False), Mover(1.0)), walks(4)
+    assert ls3.probe(agent, [episodes], episodes.exclude("state"), horizon=3) == {}
+    assert ls3.probe(agent, [episodes], episodes, horizon=5) == {}
+    assert set(ls3.probe(agent, [episodes], episodes, horizon=3)) == {"state_error", "imagined_3_steps_error"}

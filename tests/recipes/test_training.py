@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.modules import ValueEnsemble
-from ls3_torchrl.objectives import OfflineValueLoss, TD1ValueLoss
+from ls3_torchrl.objectives import OfflineValueLoss, TD1ValueLoss, VAELoss
 from training import Learner, Term, Training, check_settings
 
 
@@ -124,6 +124,20 @@ def test_mean_latents_feed_posterior_means_to_the_models_that_are_named(config):
     assert training.goal.loss.tensor_keys.latent == ("next", "loc")
     assert training.constraint.loss.tensor_keys.latent == ("next", "latent")
     assert training.safe_set.loss.tensor_keys.latent == "latent"
+
+
+@pytest.mark.parametrize(("warmup", "shares"), [(0.0, [1.0, 1.0, 1.0, 1.0]), (0.75, [1 / 3, 2 / 3, 1.0, 1.0])])
+def test_beta_rises_over_its_share_of_the_steps(config, monkeypatch, warmup, shares):
+    OmegaConf.update(config, "vae", {"steps": 4, "batch_size": 2, "beta": 0.3, "beta_warmup": warmup})
+    agent = LS3Agent(action_dim=2, **config.agent)
+    buffer = TaggedReplayBuffer(20, latent_dim=config.agent.latent_dim)
+    step = {"reward": -torch.ones(3, 1), "pixels": torch.zeros(3, 3, 64, 64, dtype=torch.uint8)}
+    step |= {k: torch.zeros(3, 1, dtype=torch.bool) for k in ("constraint", "success")}
+    buffer.add(TensorDict({"pixels": step["pixels"], "action": torch.zeros(3, 2), "next": step}, [3]), "success")
+    seen, forward = [], VAELoss.forward
+    monkeypatch.setattr(VAELoss, "forward", lambda self, td: (seen.append(self.beta), forward(self, td))[1])
+    Training(agent, buffer, config, Silent()).train_vae()
+    assert seen == pytest.approx([0.3 * share for share in shares])
 
 
 def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_horizon(config):
