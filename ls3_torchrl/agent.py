@@ -44,6 +44,7 @@ class AgentArchitecture:
     classifier_hidden: tuple[int, ...] = (256, 256, 256)
     initial_value: float = 0.0
     propagation: Literal["ts1", "tsinf"] = "ts1"
+    control_affine: bool = False
 
 
 class LS3Agent(nn.Module):
@@ -60,6 +61,7 @@ class LS3Agent(nn.Module):
         classifier_hidden: hidden layers of f_S, f_C and f_G.
         initial_value: where the value networks' output biases start.
         propagation: ``"ts1"`` or ``"tsinf"``.
+        control_affine: the dynamics' change of the latent is affine in the action.
 
     Raises:
         ValueError: for sizes below 1 or an unknown propagation; by :meth:`load`, for a file that is no agent,
@@ -89,6 +91,7 @@ class LS3Agent(nn.Module):
         classifier_hidden: Sequence[int] = (256, 256, 256),
         initial_value: float = 0.0,
         propagation: Literal["ts1", "tsinf"] = "ts1",
+        control_affine: bool = False,
     ) -> None:
         super().__init__()
         for name, size in (
@@ -108,11 +111,17 @@ class LS3Agent(nn.Module):
             classifier_hidden=tuple(classifier_hidden),
             initial_value=initial_value,
             propagation=propagation,
+            control_affine=control_affine,
         )
         self.encoder = PixelEncoder(in_channels, latent_dim)
         self.decoder = PixelDecoder(in_channels, latent_dim)
         self.dynamics = EnsembleDynamics(
-            latent_dim, action_dim, num_members=num_dynamics, hidden=dynamics_hidden, propagation=propagation
+            latent_dim,
+            action_dim,
+            num_members=num_dynamics,
+            hidden=dynamics_hidden,
+            propagation=propagation,
+            control_affine=control_affine,
         )
         self.value = ValueEnsemble(latent_dim, num_members=num_values, hidden=value_hidden, initial_value=initial_value)
         self.safe_set = SafeSet(latent_dim, hidden=classifier_hidden)

@@ -73,8 +73,9 @@ def check_settings(config: DictConfig) -> None:
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"{name} must lie in [0, 1], got {value}.")
     loss = config.loss
-    if loss.failure_weight < 0.0:
-        raise ValueError(f"loss.failure_weight must not be negative, got {loss.failure_weight}.")
+    for name in ("failure_weight", "undecided_weight"):
+        if loss[name] < 0.0:
+            raise ValueError(f"loss.{name} must not be negative, got {loss[name]}.")
     unknown = set(loss.mean_latents) - set(MEAN_LATENTS)
     if unknown:
         raise ValueError(
@@ -222,7 +223,7 @@ class Training:
         self.safe_set = Learner(
             "safe_set",
             SafeSetLoss(agent.safe_set, gamma=loss.gamma_safe_set),
-            draw(ALL_TAGS),
+            self._safe_or_not,
             lr=optim.lr,
             target_interval=interval,
         )
@@ -240,6 +241,15 @@ class Training:
         )
         value = self.config.loss.failure_value
         return rows.set("reward_to_go", torch.full_like(rows["reward_to_go"], value))
+
+    def _safe_or_not(self) -> TensorDictBase:
+        """Rows of all data; how much those of undecided online episodes count is a setting."""
+        rows = self.buffer.sample(self.config.optim.batch_size, tags=ALL_TAGS)
+        weight = self.config.loss.undecided_weight
+        if weight != 1.0:
+            undecided = rows["undecided"] & (rows["tag"] == int(Tag.ONLINE))
+            rows.set("safe_set_weight", torch.where(undecided, weight, 1.0))
+        return rows
 
     def train_vae(self) -> None:
         """Train encoder and decoder on all frames, freeze them, and encode every frame."""

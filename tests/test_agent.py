@@ -71,6 +71,16 @@ def test_propagation_travels_with_the_file(tmp_path):
     assert LS3Agent.load(tiny(propagation="tsinf").save(tmp_path / "a.pt")).dynamics.propagation == "tsinf"
 
 
+def test_the_form_of_the_dynamics_travels_with_the_file(tmp_path):
+    agent = LS3Agent(action_dim=2, latent_dim=4, control_affine=True)
+    loaded = LS3Agent.load(agent.save(tmp_path / "agent.pt"))
+    latent, action = torch.randn(3, 4), torch.randn(3, 2)
+    for one, other in zip(
+        agent.dynamics.distribution(latent, action), loaded.dynamics.distribution(latent, action), strict=True
+    ):
+        assert torch.equal(one, other)
+
+
 def test_saving_again_replaces_the_file(tmp_path):
     tiny(0).save(tmp_path / "agent.pt")
     other = tiny(1)

@@ -17,7 +17,7 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from ls3_torchrl._checks import require_at_least, require_finite, require_keys
-from ls3_torchrl.data.labels import failure_tail, in_success, reward_to_go
+from ls3_torchrl.data.labels import failure_tail, in_success, reward_to_go, undecided
 from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.tags import ALL_TAGS, Tag
 from ls3_torchrl.modules.vae import PixelEncoder
@@ -135,6 +135,7 @@ class TaggedReplayBuffer:
                 "action": episode["action"],
                 "tag": torch.full((steps, 1), int(tag), dtype=torch.uint8),
                 "in_success": in_success(success),
+                "undecided": undecided(success, episode["next", "constraint"]),
                 "reward_to_go": reward_to_go(reward, self.gamma, tail),
                 "frame": first + torch.arange(steps).unsqueeze(-1),
                 "next": {

@@ -58,6 +58,25 @@ def failure_tail(reward: Tensor, success: Tensor, gamma: float) -> Tensor:
     return torch.where(success.any(-2), torch.zeros_like(endless), endless)
 
 
+def undecided(success: Tensor, constraint: Tensor) -> Tensor:
+    """Whether a trajectory neither reaches the goal nor violates a constraint: it tells of no state that it is unsafe.
+
+    Args:
+        success: bool ``[*B, T, 1]``.
+        constraint: bool ``[*B, T, 1]``, whether the step's next state violates.
+
+    Returns:
+        bool ``[*B, T, 1]``, alike for all steps of a trajectory.
+
+    Example:
+        >>> never, late = torch.zeros(3, 1, dtype=torch.bool), torch.tensor([[False], [False], [True]])
+        >>> undecided(never, never).flatten().tolist(), undecided(never, late).flatten().tolist()
+        ([True, True, True], [False, False, False])
+    """
+    decided = success.any(-2, keepdim=True) | constraint.any(-2, keepdim=True)
+    return (~decided).expand_as(success)
+
+
 def in_success(success: Tensor) -> Tensor:
     """1_S(s_t): the trajectory reaches the goal at or after this step (the label of equation (5)).
 

@@ -20,7 +20,11 @@ class EnsembleDynamics(TensorDictModuleBase):
     """M networks, each a Gaussian over the next latent: N(z + Δ_m(z, a), σ_m(z, a)²).
 
     Two hidden layers of 128 (section 1.1.1). ``forward`` imagines one step: every row, a particle, is moved by
-    one member and its noise.
+    one member and its noise. The change Δ_m(z, a) and σ_m are
+
+    * a network of latent and action together, the paper's choice; or
+    * with ``control_affine``, Δ_m = b_m(z) + A_m(z) a and σ_m(z), networks of the latent alone. Most mechanics have
+      this form, and few demonstrations then tell what actions do that they hardly contain.
 
     * ``"ts1"``: each row draws a member anew at every step (TS-1, the paper's choice).
     * ``"tsinf"``: a row keeps the member that it drew first; it travels under ``member_key`` (TS-∞).
@@ -33,6 +37,7 @@ class EnsembleDynamics(TensorDictModuleBase):
         num_members: M.
         hidden: sizes of the hidden layers.
         propagation: ``"ts1"`` or ``"tsinf"``.
+        control_affine: the change of the latent is affine in the action.
         log_scale_bounds: range that the log standard deviation is clamped to.
         latent_key: latent ``[*B, D]``.
         action_key: action ``[*B, A]``, in the environment's units.
@@ -63,6 +68,7 @@ class EnsembleDynamics(TensorDictModuleBase):
         num_members: int = 5,
         hidden: Sequence[int] = (128, 128),
         propagation: Propagation = "ts1",
+        control_affine: bool = False,
         log_scale_bounds: tuple[float, float] = (-8.0, 4.0),
         latent_key: NestedKey = "latent",
         action_key: NestedKey = "action",
@@ -77,11 +83,36 @@ class EnsembleDynamics(TensorDictModuleBase):
             raise ValueError(f"log_scale_bounds must rise, got {log_scale_bounds}.")
         self.latent_dim, self.action_dim, self.num_members = latent_dim, action_dim, num_members
         self.propagation: Propagation = propagation
+        self.control_affine = control_affine
         self.log_scale_bounds = (float(low), float(high))
         self.in_keys = [latent_key, action_key]
         self.out_keys = [next_latent_key]
         self.member_key, self.noise_key = member_key, noise_key
-        self.network = EnsembleMLP(latent_dim + action_dim, 2 * latent_dim, num_members=num_members, hidden=hidden)
+        sizes = (
+            (latent_dim, (2 + action_dim) * latent_dim) if control_affine else (latent_dim + action_dim, 2 * latent_dim)
+        )
+        self.network = EnsembleMLP(*sizes, num_members=num_members, hidden=hidden)
+
+    def network_input(self, latent: Tensor, action: Tensor) -> Tensor:
+        """What the network sees of a latent ``[*B, D]`` and an action ``[*B, A]``."""
+        return latent if self.control_affine else torch.cat([latent, action], -1)
+
+    def read_output(self, output: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """The mean change of the latent and its log standard deviation, each ``[*B, D]``.
+
+        Args:
+            output: what the network wrote, ``[*B, 2 D]``; b, log σ and the rows of A, ``[*B, (2 + A) D]``, if
+                ``control_affine``.
+            action: ``[*B, A]``.
+        """
+        if not self.control_affine:
+            delta, log_scale = output.chunk(2, -1)
+        else:
+            drift, log_scale, gain = output.split(
+                [self.latent_dim, self.latent_dim, self.latent_dim * self.action_dim], -1
+            )
+            delta = drift + (gain.unflatten(-1, (self.latent_dim, self.action_dim)) * action.unsqueeze(-2)).sum(-1)
+        return delta, log_scale.clamp(*self.log_scale_bounds)
 
     def distribution(self, latent: Tensor, action: Tensor, *, per_member: bool = False) -> tuple[Tensor, Tensor]:
         """Every member's mean and standard deviation of the next latent.
@@ -94,9 +125,11 @@ class EnsembleDynamics(TensorDictModuleBase):
         Returns:
             Mean and standard deviation, each ``[*B, M, D]``.
         """
-        delta, log_scale = self.network(torch.cat([latent, action], -1), per_member=per_member).chunk(2, -1)
-        loc = (latent if per_member else latent.unsqueeze(-2)) + delta
-        return loc, log_scale.clamp(*self.log_scale_bounds).exp()
+        output = self.network(self.network_input(latent, action), per_member=per_member)
+        if not per_member:
+            latent, action = latent.unsqueeze(-2), action.unsqueeze(-2)
+        delta, log_scale = self.read_output(output, action)
+        return latent + delta, log_scale.exp()
 
     def draw_members(self, num_rows: int, *, device: torch.device | None = None) -> Tensor:
         """Members for ``num_rows`` particles, int64 ``[num_rows]``: as even a split as can be, in random order."""

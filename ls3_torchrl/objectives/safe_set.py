@@ -20,6 +20,9 @@ from ls3_torchrl.objectives.value import check_discount
 class SafeSetLoss(LossModule):
     """Binary cross-entropy of f_S(z_t) to max(1_S(z_t), γ_S f_S'(z_{t+1})) (equation (5)).
 
+    Rows may carry a weight under ``weight``; those of a trajectory that neither succeeded nor violated, say, tell
+    little of whether its states are safe. Without the key all rows count alike, as in the paper.
+
     The target is built by a lagged copy f_S' of the safe set itself: fixed-point iteration. Couple it with
     ``HardUpdate(loss, value_network_update_interval=99)`` for a copy every 100 updates.
 
@@ -54,11 +57,13 @@ class SafeSetLoss(LossModule):
             latent (NestedKey): z_t.
             next_latent (NestedKey): z_{t+1}.
             in_success (NestedKey): 1_S(z_t), the state is part of a trajectory that still succeeds.
+            weight (NestedKey): weight of each row in the mean, optional.
         """
 
         latent: NestedKey = "latent"
         next_latent: NestedKey = ("next", "latent")
         in_success: NestedKey = "in_success"
+        weight: NestedKey = "safe_set_weight"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -75,7 +80,7 @@ class SafeSetLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """The keys that are read, as ``set_keys`` left them."""
+        """The keys that must be there, as ``set_keys`` left them."""
         keys = self.tensor_keys
         return [keys.latent, keys.next_latent, keys.in_success]
 
@@ -93,5 +98,6 @@ class SafeSetLoss(LossModule):
         keys = self.tensor_keys
         require_keys(tensordict, self.in_keys, "SafeSetLoss")
         target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.in_success))
+        weight = tensordict.get(keys.weight, None)
         logit = evaluate(self.safe_set, tensordict.get(keys.latent), params=self.safe_set_params)
-        return as_scalars(loss_safe_set=binary_cross_entropy_with_logits(logit, target))
+        return as_scalars(loss_safe_set=binary_cross_entropy_with_logits(logit, target, weight))

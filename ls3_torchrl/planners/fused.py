@@ -300,18 +300,18 @@ class FusedImagination:
 
         Members ``[H, G]`` pick the weights that move each particle; noise is ``[H, G, R or 1, D]``.
         """
-        low, high = self.env.dynamics.log_scale_bounds
+        dynamics = self.env.dynamics
         particles, rows = members.shape[1], plan.shape[1]
         state = latent.expand(particles, rows, -1)
         last = len(self._dynamics) - 1
         path = []
         for action, member, step_noise in zip(plan, members, noise, strict=True):
-            x = torch.cat([state, action.expand(particles, -1, -1)], -1).to(self._dtype)
+            x = dynamics.network_input(state, action.expand(particles, -1, -1)).to(self._dtype)
             for i, (weight, bias) in enumerate(self._dynamics):
                 x = torch.baddbmm(bias[member], x, weight[member])
                 if i < last:
                     x = x.relu_()
-            delta, log_scale = x.float().chunk(2, -1)
-            state = torch.addcmul(state + delta, log_scale.clamp(low, high).exp(), step_noise.expand_as(delta))
+            delta, log_scale = dynamics.read_output(x.float(), action)
+            state = torch.addcmul(state + delta, log_scale.exp(), step_noise.expand_as(delta))
             path.append(state.to(self._dtype))
         return torch.stack(path, 1)

@@ -68,6 +68,39 @@ def test_next_latent_equals_a_computation_by_hand():
     torch.testing.assert_close(dynamics(td)["next", "latent"], expected)
 
 
+def test_a_control_affine_step_equals_a_computation_by_hand():
+    dynamics = EnsembleDynamics(2, 3, num_members=2, hidden=(), control_affine=True)
+    # Outputs of member 1 at z = (1, -2): b, log sigma and the rows of A.
+    drift, log_scale = torch.tensor([0.5, -1.0]), torch.tensor([math.log(0.5), math.log(2.0)])
+    gain = torch.tensor([[1.0, 2.0, 3.0], [-1.0, 0.0, 4.0]])
+    z, a = torch.tensor([1.0, -2.0]), torch.tensor([0.1, -0.2, 0.3])
+    slope = torch.arange(10.0).reshape(10)  # every output also grows with z0
+    with torch.no_grad():
+        dynamics.network.weights[0].zero_()
+        dynamics.network.weights[0][1, 0] = slope
+        dynamics.network.biases[0][1, 0] = torch.cat([drift, log_scale, gain.flatten()]) - slope * z[0]
+    noise = torch.tensor([1.0, -1.0])
+    td = TensorDict({"latent": z, "action": a, "dynamics_member": torch.tensor([1]), "dynamics_noise": noise})
+    expected = z + drift + gain @ a + torch.tensor([0.5, 2.0]) * noise
+    torch.testing.assert_close(dynamics(td)["next", "latent"], expected)
+
+
+def test_control_affine_members_see_their_own_column_alone():
+    dynamics = EnsembleDynamics(3, 2, num_members=4, hidden=(8,), control_affine=True)
+    latent, action = torch.randn(5, 3), torch.randn(5, 2)
+    loc, scale = dynamics.distribution(latent, action)
+    copies = latent[:, None].repeat(1, 4, 1), action[:, None].repeat(1, 4, 1)
+    for one, other in zip(dynamics.distribution(*copies, per_member=True), (loc, scale), strict=True):
+        torch.testing.assert_close(one, other)
+    copies[1][:, 1] += 1.0
+    moved, same_scale = dynamics.distribution(*copies, per_member=True)
+    assert (moved != loc).any(0).any(-1).tolist() == [False, True, False, False]
+    torch.testing.assert_close(same_scale, scale)
+    # Affine: twice the action, twice the change that is due to it.
+    rest, once, twice = (dynamics.distribution(latent, k * action)[0] for k in (0.0, 1.0, 2.0))
+    torch.testing.assert_close(twice - rest, 2 * (once - rest))
+
+
 def test_distribution_gives_each_members_mean_and_scale_around_the_latent():
     dynamics = EnsembleDynamics(3, 2, num_members=4, hidden=(8,))
     latent, action = torch.randn(5, 3), torch.randn(5, 2)

@@ -60,6 +60,23 @@ def test_target_and_loss_by_hand():
     assert loss(batch)["loss_safe_set"].item() == pytest.approx(by_hand, rel=1e-5)
 
 
+def test_rows_count_by_their_weight_where_they_have_one():
+    z, z_next, in_success = [0.3, -1.0, 2.0], [1.0, 2.0, -3.0], [True, False, False]
+    loss = lagged_loss(linear_safe_set(2.0), gamma=0.3)
+    batch = transitions(z, z_next, in_success)
+    each = [
+        cross_entropy(sigmoid(2 * a), max(float(s), 0.3 * sigmoid(2 * b)))
+        for a, b, s in zip(z, z_next, in_success, strict=True)
+    ]
+    weight = torch.tensor([[1.0], [0.0], [0.25]])
+    by_hand = (each[0] + 0.25 * each[2]) / 3
+    assert loss(batch.clone().set("safe_set_weight", weight))["loss_safe_set"].item() == pytest.approx(by_hand)
+    ones = batch.clone().set("safe_set_weight", torch.ones(3, 1))
+    torch.testing.assert_close(loss(ones)["loss_safe_set"], loss(batch)["loss_safe_set"])
+    loss.set_keys(weight=("mine", "weight"))
+    assert loss(batch.clone().set(("mine", "weight"), weight))["loss_safe_set"].item() == pytest.approx(by_hand)
+
+
 def test_float_labels_are_as_good_as_booleans():
     loss = lagged_loss(linear_safe_set(2.0))
     batch = transitions([0.3, -1.0], [1.0, 2.0], [True, False])

@@ -14,10 +14,10 @@ B, N, H, P = 2, 7, 3, 4
 NAMES = ("dynamics", "constraint", "goal", "value", "safe_set")
 
 
-def build(seed=0):
+def build(seed=0, **dynamics):
     torch.manual_seed(seed)
     return {
-        "dynamics": EnsembleDynamics(D, A, num_members=M, hidden=(8,)),
+        "dynamics": EnsembleDynamics(D, A, num_members=M, hidden=(8,), **dynamics),
         "constraint": ConstraintEstimator(D, hidden=(8,)),
         "goal": GoalEstimator(D, hidden=(8,)),
         "value": ValueEnsemble(D, num_members=2, hidden=(8,)),
@@ -148,6 +148,12 @@ def test_log_scales_are_clamped_as_in_the_module():
     plain = RolloutImagination(env_of(parts), parts["value"], parts["safe_set"])(*problem())
     for got, want in zip(fused_of(parts, precision="fp32")(*problem()), plain, strict=True):
         torch.testing.assert_close(got, want, atol=1e-3, rtol=1e-4)
+
+
+def test_control_affine_dynamics_are_imagined_as_in_the_module():
+    parts = build(control_affine=True)
+    plain = RolloutImagination(env_of(parts), parts["value"], parts["safe_set"])(*problem())
+    assert_same(fused_of(parts, precision="fp32")(*problem()), plain)
 
 
 def test_auto_settles_on_what_was_measured():

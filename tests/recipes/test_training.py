@@ -80,6 +80,39 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(config):
     }
 
 
+def test_undecided_episodes_count_as_the_setting_says_online_alone(config):
+    agent = LS3Agent(action_dim=2, **config.agent)
+    buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
+
+    def episode(**ends):
+        step = {"reward": -torch.ones(9, 1), "pixels": torch.zeros(9, 3, 64, 64, dtype=torch.uint8)}
+        step |= {k: torch.zeros(9, 1, dtype=torch.bool) for k in ("constraint", "success")}
+        for key in ends:
+            step[key][-1] = True
+        return TensorDict({"pixels": step["pixels"], "action": torch.zeros(9, 2), "next": step}, [9])
+
+    buffer.add(episode(success=True), "success")
+    buffer.add(episode(), "rand")
+    for outcome in ({}, {"success": True}, {"constraint": True}):
+        buffer.add(episode(**outcome), "online")
+    buffer.encode(agent.encoder)
+    rows = Training(agent, buffer, config, Silent()).safe_set.sample()
+    assert "safe_set_weight" not in rows  # as in the paper
+    OmegaConf.update(config, "loss.undecided_weight", 0.25)
+    OmegaConf.update(config, "optim.batch_size", 400)
+    rows = Training(agent, buffer, config, Silent()).safe_set.sample()
+    outcome = [rows["next", key].flatten() for key in ("success", "constraint")]
+    online = rows["tag"].flatten() == int(Tag.ONLINE)
+    weight = rows["safe_set_weight"].flatten()
+    light = weight == 0.25
+    assert light.any()
+    assert (weight[~light] == 1.0).all()
+    # The undecided online episode is the third of the five that were added.
+    assert torch.equal(light, (rows["frame"].flatten() >= 20) & (rows["frame"].flatten() < 30))
+    assert online[light].all()
+    assert not any(kind[light].any() for kind in outcome)
+
+
 def test_a_term_beside_the_loss_pulls_the_same_network_with_its_weight():
     value = ValueEnsemble(4, num_members=1, hidden=(16,))
     z, far = torch.zeros(32, 4), torch.ones(32, 4)
@@ -153,6 +186,7 @@ def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_horizon(conf
         ("vae.schedule", "cosine"),
         ("vae.beta_warmup", 1.5),
         ("loss.failure_weight", -0.1),
+        ("loss.undecided_weight", -0.1),
         ("loss.mean_latents", ["value"]),
         ("vae.reduction", "median"),
         ("vae.crop_scale", [0.5, 1.5]),
