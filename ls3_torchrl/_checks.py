@@ -52,3 +52,10 @@ def require_at_least(value: int, low: int, name: str) -> int:
     if value < low:
         raise ValueError(f"{name} must be at least {low}, got {value}.")
     return value
+
+
+def require_positive(value: float, name: str) -> float:
+    """Return ``value`` when it is a finite number above 0; raise ``ValueError`` otherwise."""
+    if not 0.0 < value < float("inf"):
+        raise ValueError(f"{name} must be a finite number above 0, got {value}.")
+    return value

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import torch
 from omegaconf import DictConfig
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.objectives import HardUpdate, LossModule
 
 from common import RunFolder, progress
@@ -17,11 +17,13 @@ from ls3_torchrl.data import ALL_TAGS, VALUE_TAGS, Tag, TaggedReplayBuffer, rand
 from ls3_torchrl.objectives import (
     ClassifierLoss,
     EnsembleDynamicsLoss,
+    LatentPredictionLoss,
     OfflineValueLoss,
     SafeSetLoss,
     TD1ValueLoss,
     VAELoss,
 )
+from ls3_torchrl.planners.fused import fastest_precision
 
 LOG_EVERY = 100
 #: What can learn from the posteriors' means instead of samples.
@@ -49,10 +51,11 @@ def check_settings(config: DictConfig) -> None:
     allowed = {
         "vae.schedule": (vae.schedule, ("constant", "onecycle")),
         "vae.reduction": (vae.reduction, ("mean", "sum")),
+        "vae.autocast": (vae.autocast, (True, False, "auto")),
     }
     for name, (value, choices) in allowed.items():
         if value not in choices:
-            raise ValueError(f"{name} must be one of {', '.join(choices)}; got {value!r}.")
+            raise ValueError(f"{name} must be one of {', '.join(map(str, choices))}; got {value!r}.")
     if vae.crop_scale is not None and not (
         len(vae.crop_scale) == 2 and 0 < vae.crop_scale[0] <= vae.crop_scale[1] <= 1
     ):
@@ -86,6 +89,8 @@ def check_settings(config: DictConfig) -> None:
             "loss.monte_carlo needs loss.continue_failures: otherwise a failure's return ends with the horizon and is "
             "no lower bound."
         )
+    if vae.prediction_weight < 0.0:
+        raise ValueError(f"vae.prediction_weight must not be negative, got {vae.prediction_weight}.")
     for name, value in positive.items():
         if not value > 0:
             raise ValueError(f"{name} must be positive, got {value}.")
@@ -258,27 +263,35 @@ class Training:
             half.to(memory_format=torch.channels_last)
         loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta, reduction=options.reduction)
         loss.set_keys(target="target_pixels")
-        optimizer = torch.optim.Adam(loss.parameters(), lr=options.lr, fused=True)
+        predictability = LatentPredictionLoss(agent.encoder, agent.dynamics)
+        predictability.set_keys(pixels="target_pixels")
+        weight = options.prediction_weight
+        learnt = [*loss.parameters(), *(agent.dynamics.parameters() if weight else ())]
+        optimizer = torch.optim.Adam(learnt, lr=options.lr, fused=True)
         schedule = (
             torch.optim.lr_scheduler.OneCycleLR(optimizer, options.lr, total_steps=options.steps, pct_start=0.1)
             if options.schedule == "onecycle"
             else torch.optim.lr_scheduler.ConstantLR(optimizer, factor=1.0)
         )
         device = next(agent.parameters()).device
+        autocast = fastest_precision(device.type) == "bf16" if options.autocast == "auto" else options.autocast
+        draw = self.buffer.sample_pixel_transitions if weight else self.buffer.sample_pixels
         with threads(options.threads), progress(options.steps, "VAE") as bar:
             for i in range(options.steps):
-                loss.beta = options.beta * min(1.0, (i + 1) / max(options.beta_warmup * options.steps, 1.0))
-                target = self.buffer.sample_pixels(options.batch_size)["pixels"].to(device)
-                pixels = (
-                    target
-                    if options.crop_scale is None
-                    else random_resized_crop(target, scale=tuple(options.crop_scale))
-                )
-                batch = TensorDict({"pixels": pixels, "target_pixels": target}, [len(target)])
-                with torch.autocast(device.type, torch.bfloat16, enabled=options.autocast):
+                warmth = min(1.0, (i + 1) / max(options.beta_warmup * options.steps, 1.0))
+                loss.beta = options.beta * warmth
+                batch = draw(options.batch_size).to(device).rename_key_("pixels", "target_pixels")
+                target = batch["target_pixels"]
+                crop = options.crop_scale
+                batch["pixels"] = target if crop is None else random_resized_crop(target, scale=tuple(crop))
+                with torch.autocast(device.type, torch.bfloat16, enabled=autocast):
                     losses = loss(batch)
+                    value = losses["loss_vae"]
+                    if weight:
+                        losses["prediction"] = predictability(batch)["loss_prediction"]
+                        value = value + warmth * weight * losses["prediction"]
                 optimizer.zero_grad()
-                losses["loss_vae"].backward()
+                value.backward()
                 optimizer.step()
                 schedule.step()
                 if i % LOG_EVERY == 0 or i == options.steps - 1:
@@ -290,8 +303,17 @@ class Training:
                 bar.update()
         agent.encoder.requires_grad_(False)
         agent.decoder.requires_grad_(False)
+        self._encode()
+        if options.unit_scale:
+            spread = float(self.buffer.latents.storage[:]["loc"].std(0).square().mean().sqrt())
+            agent.encoder.rescale(1.0 / spread)
+            agent.decoder.rescale(1.0 / spread)
+            self._encode()
+
+    def _encode(self) -> None:
+        """Encode every frame."""
         with progress(len(self.buffer.pixels), "Encoding", "frame") as bar:
-            self.buffer.encode(agent.encoder, progress=lambda done, _: bar.update(done - bar.n))
+            self.buffer.encode(self.agent.encoder, progress=lambda done, _: bar.update(done - bar.n))
 
     def train_offline(self) -> None:
         """Train the latent models on the offline data (equations (2), (3), (4), (5) and the classifiers)."""

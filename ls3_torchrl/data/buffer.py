@@ -43,8 +43,8 @@ class TaggedReplayBuffer:
     Raises:
         ValueError: for a capacity below 1, or (in :meth:`add`) data that are not finite.
         KeyError: in :meth:`add`, for a missing key.
-        RuntimeError: in :meth:`sample`, without encoder or without rows of the tags; in :meth:`encode`, when
-            frames were overwritten.
+        RuntimeError: in :meth:`sample`, without encoder or without rows of the tags; in :meth:`encode` and
+            :meth:`sample_pixel_transitions`, when frames were overwritten.
 
     Example:
         >>> from ls3_torchrl.modules import PixelEncoder
@@ -167,19 +167,22 @@ class TaggedReplayBuffer:
         self._encoder = encoder
         if rows is None:
             return
-        oldest = self._frames_written - len(self.pixels)
-        if int(rows["frame"].min()) < oldest:
-            raise RuntimeError(
-                f"Frames older than number {oldest} were overwritten, but transitions still need frame "
-                f"{int(rows['frame'].min())}. Give the buffer a larger pixel_capacity (now {self.pixel_capacity})."
-            )
-        stored = self.pixels.storage[:]["pixels"]
-        posteriors = self._encode_frames(stored, progress)
-        slot = (rows["frame"].flatten() % self.pixel_capacity).to(posteriors.device)
-        after = (slot + 1) % self.pixel_capacity
+        slot, after = self._slots(rows["frame"])
+        posteriors = self._encode_frames(self.pixels.storage[:]["pixels"], progress)
         for key in ("loc", "scale"):  # in place: the rows are a view of the storage
             rows.get(key).copy_(posteriors[key][slot])
             rows.get(("next", key)).copy_(posteriors[key][after])
+
+    def _slots(self, frame: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where the pixel store keeps the frames before and after transitions, ``[B]`` each."""
+        oldest, first = self._frames_written - len(self.pixels), int(frame.min())
+        if first < oldest:
+            raise RuntimeError(
+                f"Frames older than number {oldest} were overwritten, but transitions still need frame {first}. Give "
+                f"the buffer a larger pixel_capacity (now {self.pixel_capacity})."
+            )
+        slot = frame.flatten() % self.pixel_capacity
+        return slot, (slot + 1) % self.pixel_capacity
 
     def _encode_frames(
         self, frames: torch.Tensor, progress: Callable[[int, int], None] | None = None, chunk: int = 512
@@ -239,6 +242,15 @@ class TaggedReplayBuffer:
             loc = group.get("loc")
             group.set("latent", torch.addcmul(loc, group.get("scale"), torch.randn_like(loc)))
         return rows if members is None else rows.reshape(batch_size, members)
+
+    def sample_pixel_transitions(self, batch_size: int, *, tags: Iterable[Tag | str] = ALL_TAGS) -> TensorDictBase:
+        """``pixels``, ``action`` and ``("next", "pixels")`` of transitions, uniformly from the union of the tags.
+
+        Unlike :meth:`sample`, it needs no encoder.
+        """
+        rows = self.view(tags).sample(batch_size)
+        before, after = (self.pixels.storage[slot]["pixels"] for slot in self._slots(rows["frame"]))
+        return TensorDict({"pixels": before, "action": rows["action"], "next": {"pixels": after}}, [batch_size])
 
     def sample_pixels(self, batch_size: int) -> TensorDictBase:
         """Images ``pixels`` ``[B, C, 64, 64]``, uint8, uniformly from all frames."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
@@ -15,7 +17,7 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 from torchrl.modules import NormalParamExtractor
 
-from ls3_torchrl._checks import require_at_least, require_finite, require_keys
+from ls3_torchrl._checks import require_at_least, require_finite, require_keys, require_positive
 
 IMAGE_SIZE = 64
 _FEATURES = 256
@@ -158,6 +160,21 @@ class PixelEncoder(ProbabilisticTensorDictSequential):
         self.pixels_key, self.latent_key = pixels_key, latent_key
         self.loc_key, self.scale_key = loc_key, scale_key
 
+    @torch.no_grad()
+    def rescale(self, factor: float) -> None:
+        """Measure latents in another unit: means and standard deviations become ``factor`` times what they were.
+
+        With :meth:`PixelDecoder.rescale` by the same factor every reconstruction stays as it is.
+
+        Args:
+            factor: above 0.
+        """
+        require_positive(factor, "factor")
+        head = self[0].module.head
+        head.weight[: self.latent_dim] *= factor
+        head.bias[: self.latent_dim] *= factor
+        head.bias[self.latent_dim :] += math.log(factor)
+
 
 class PixelDecoder(TensorDictModuleBase):
     """f_dec: latents back to images (equation (1)).
@@ -205,6 +222,14 @@ class PixelDecoder(TensorDictModuleBase):
             nn.ReLU(),
             nn.ConvTranspose2d(32, out_channels, 6, stride=2),
         )
+
+    @torch.no_grad()
+    def rescale(self, factor: float) -> None:
+        """Read latents that are ``factor`` times what they were; see :meth:`PixelEncoder.rescale`."""
+        require_positive(factor, "factor")
+        first = self.network[0]
+        assert isinstance(first, nn.Linear)
+        first.weight /= factor
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the reconstruction of the latent."""
