@@ -236,6 +236,29 @@ def test_pixels_are_sampled_uniformly_from_all_frames_last_ones_included(scratch
     assert (torch.bincount(pixels[:, 0, 0, 0].long(), minlength=4) - 100).abs().max() < 45
 
 
+def test_pixel_transitions_join_both_images_to_their_action_after_the_ring_wrapped(scratch):
+    torch.manual_seed(0)
+    film = Film()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, pixel_capacity=13, scratch_dir=scratch)
+    for tag in ("success", "constraint", "online"):
+        buffer.add(film.shoot(4), tag)
+    batch = buffer.sample_pixel_transitions(400)  # no encoder yet
+    number = batch["action"][:, 0].int()
+    assert set(number.tolist()) == {2, 3, 5, 6, 7, 8, 10, 11, 12, 13}
+    assert torch.equal(batch["pixels"][:, 0, 0, 0].int(), number)
+    assert torch.equal(batch["next", "pixels"][:, 2, 5, 7].int(), number + 1)
+    assert set(buffer.sample_pixel_transitions(200, tags=["online"])["action"][:, 0].tolist()) == {10, 11, 12, 13}
+
+
+def test_pixel_transitions_whose_images_are_gone_are_refused():
+    film = Film()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, pixel_capacity=10)
+    for _ in range(3):
+        buffer.add(film.shoot(4), "success")
+    with pytest.raises(RuntimeError, match=r"older than number 5 were overwritten.*pixel_capacity"):
+        buffer.sample_pixel_transitions(200)
+
+
 @pytest.mark.parametrize(("key", "what"), [("action", "action"), (("next", "reward"), "reward")])
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
 def test_numbers_that_are_not_finite_never_get_in(key, what, bad):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ls3_torchrl.data import failure_tail, in_success, reward_to_go
+from ls3_torchrl.data import failure_tail, in_success, reward_to_go, undecided
 
 
 def test_reward_to_go_by_hand():
@@ -45,6 +45,26 @@ def test_in_success_keeps_the_rows_of_a_batch_apart():
     success = torch.zeros(2, 5, 1, dtype=torch.bool)
     success[0, 3] = True
     assert in_success(success).squeeze(-1).int().tolist() == [[1, 1, 1, 1, 0], [0, 0, 0, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("success", "constraint", "expected"),
+    [
+        ([0, 0, 0], [0, 0, 0], True),
+        ([0, 1, 0], [0, 0, 0], False),
+        ([0, 0, 0], [1, 0, 0], False),
+        ([0, 0, 1], [0, 1, 0], False),
+    ],
+)
+def test_undecided_is_neither_a_success_nor_a_violation(success, constraint, expected):
+    outcome = (torch.tensor(values).bool().unsqueeze(-1) for values in (success, constraint))
+    assert undecided(*outcome).flatten().tolist() == [expected] * 3
+
+
+def test_undecided_keeps_the_rows_of_a_batch_apart():
+    success = torch.zeros(2, 5, 1, dtype=torch.bool)
+    success[0, 3] = True
+    assert undecided(success, torch.zeros_like(success)).squeeze(-1).int().tolist() == [[0] * 5, [1] * 5]
 
 
 def test_a_failure_goes_on_for_ever_with_its_last_reward():

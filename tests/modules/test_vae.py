@@ -223,3 +223,23 @@ def test_layers_that_are_one_matrix_product_equal_the_convolution_with_its_gradi
     for mine, plain in zip(*results, strict=True):
         assert mine.shape == plain.shape
         assert torch.allclose(mine, plain, rtol=1e-4, atol=1e-4 * plain.abs().max().item())
+
+
+def test_rescaled_latents_are_the_same_posteriors_in_another_unit_and_decode_alike():
+    torch.manual_seed(0)
+    encoder, decoder = PixelEncoder(latent_dim=4), PixelDecoder(latent_dim=4)
+    td = TensorDict({"pixels": some_pixels(3)}, [3])
+    before = decoder(encoder(td.clone()))
+    encoder.rescale(2.5)
+    decoder.rescale(2.5)
+    after = decoder(encoder(td.clone()))
+    for key in ("loc", "scale", "latent"):
+        torch.testing.assert_close(after[key], 2.5 * before[key])
+    torch.testing.assert_close(after["reco_pixels"], before["reco_pixels"])
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, float("inf"), float("nan")])
+@pytest.mark.parametrize("half", [PixelEncoder, PixelDecoder])
+def test_impossible_units_are_refused(half, factor):
+    with pytest.raises(ValueError, match="factor must be a finite number above 0"):
+        half(latent_dim=4).rescale(factor)

@@ -159,6 +159,53 @@ def test_mean_latents_feed_posterior_means_to_the_models_that_are_named(config):
     assert training.safe_set.loss.tensor_keys.latent == "latent"
 
 
+def test_unit_scale_measures_latents_in_their_spread_and_keeps_the_pictures(config):
+    torch.manual_seed(0)
+    pixels = torch.randint(256, (8, 3, 64, 64), dtype=torch.uint8)
+    step = {"reward": -torch.ones(7, 1), "pixels": pixels[1:]}
+    step |= {k: torch.zeros(7, 1, dtype=torch.bool) for k in ("constraint", "success")}
+    episode = TensorDict({"pixels": pixels[:-1], "action": torch.zeros(7, 2), "next": step}, [7])
+    pictures, spreads = [], []
+    for unit_scale in (False, True):
+        OmegaConf.update(config, "vae", {"steps": 3, "batch_size": 4, "crop_scale": None, "unit_scale": unit_scale})
+        torch.manual_seed(1)
+        agent = LS3Agent(action_dim=2, **config.agent)
+        buffer = TaggedReplayBuffer(20, latent_dim=config.agent.latent_dim)
+        buffer.add(episode, "success")
+        Training(agent, buffer, config, Silent()).train_vae()
+        spreads.append(buffer.latents.storage[:]["loc"].std(0).square().mean().sqrt().item())
+        pictures.append(agent.decoder(agent.encoder(TensorDict({"pixels": pixels}, [8])))["reco_pixels"])
+    assert spreads[1] == pytest.approx(1.0, rel=1e-3)
+    assert spreads[0] != pytest.approx(1.0, rel=1e-2)
+    torch.testing.assert_close(*pictures)
+
+
+def test_the_prediction_term_trains_the_dynamics_beside_the_vae_by_its_weight(config):
+    torch.manual_seed(0)
+    pixels = torch.randint(256, (8, 3, 64, 64), dtype=torch.uint8)
+    step = {"reward": -torch.ones(7, 1), "pixels": pixels[1:]}
+    step |= {k: torch.zeros(7, 1, dtype=torch.bool) for k in ("constraint", "success")}
+    episode = TensorDict({"pixels": pixels[:-1], "action": torch.randn(7, 2), "next": step}, [7])
+    heads = []
+    for weight in (0.0, 1.0, 1.0, 2.0):
+        torch.manual_seed(1)
+        OmegaConf.update(config, "vae", {"steps": 20, "lr": 1e-3, "prediction_weight": weight})
+        agent = LS3Agent(action_dim=2, **config.agent)
+        before = [p.detach().clone() for p in agent.dynamics.parameters()]
+        buffer = TaggedReplayBuffer(20, latent_dim=config.agent.latent_dim)
+        buffer.add(episode, "success")
+        run = Silent()
+        Training(agent, buffer, config, run).train_vae()
+        changed = [not torch.equal(a, b) for a, b in zip(before, agent.dynamics.parameters(), strict=True)]
+        assert any(changed) == (weight > 0.0)
+        assert ("prediction" in run.rows[-1][2]) == (weight > 0.0)
+        heads.append(agent.encoder[0].module.head.weight.detach())
+    # The encoder learns from it too, the more the larger the weight.
+    assert not torch.equal(heads[0], heads[1])
+    assert torch.equal(heads[1], heads[2])
+    assert not torch.equal(heads[2], heads[3])
+
+
 @pytest.mark.parametrize(("warmup", "shares"), [(0.0, [1.0, 1.0, 1.0, 1.0]), (0.75, [1 / 3, 2 / 3, 1.0, 1.0])])
 def test_beta_rises_over_its_share_of_the_steps(config, monkeypatch, warmup, shares):
     OmegaConf.update(config, "vae", {"steps": 4, "batch_size": 2, "beta": 0.3, "beta_warmup": warmup})
@@ -185,6 +232,8 @@ def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_horizon(conf
     [
         ("vae.schedule", "cosine"),
         ("vae.beta_warmup", 1.5),
+        ("vae.prediction_weight", -1.0),
+        ("vae.autocast", "bf16"),
         ("loss.failure_weight", -0.1),
         ("loss.undecided_weight", -0.1),
         ("loss.mean_latents", ["value"]),
