@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
+from statistics import fmean, median
 from typing import Any
 
 import hydra
@@ -17,12 +18,12 @@ from torchrl.data import Bounded
 from torchrl.objectives import HardUpdate
 
 import ls3_envs
-from common import RunFolder, choose_device, hardware
+from common import RunFolder, choose_device, console, hardware
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.modules.ensemble import EnsembleMLP
 from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, VAELoss
-from ls3_torchrl.planners import LS3Planner
+from ls3_torchrl.planners import ImaginationNoise, LS3Planner
 from plain import PlainVAE, plain_members
 from timing import Bench, matmul_peak, show
 from training import threads
@@ -76,12 +77,45 @@ def plans(
     if plain:
         bench.time(base, plan(planner(engine="rollout"), 1))
     for precision in ("fp32", "bf16"):
-        median = bench.time(f"plan, {name}, {precision}", plan(planner(precision=precision), 1), against=base)
-        bench.rows[-1]["gflops"] = flops / median / 1e9
+        seconds = bench.time(f"plan, {name}, {precision}", plan(planner(precision=precision), 1), against=base)
+        bench.rows[-1]["gflops"] = flops / seconds / 1e9
     for batch in batches:
         if batch > 1:
             figure = f"plan, {name}, auto, each of {batch}"
             bench.time(figure, plan(planner(), batch), per=batch, against=base)
+
+
+@torch.no_grad()
+def agreement(agent: LS3Agent, options: dict[str, Any], spec: Bounded, frames: Tensor) -> dict[str, float]:
+    """What bf16 changes in the plans of a trained agent, from some images.
+
+    Args:
+        agent: trained; only then do its heads say anything.
+        options: of its planner.
+        spec: bounds of one action.
+        frames: images ``[n, C, 64, 64]`` to plan from.
+
+    Returns:
+        ``value_error``: median over images of how far, relatively, the value of the plan chosen in bf16 lies from that
+        of the plan chosen in fp32, both judged in fp32 under the same noise. ``feasibility``: share of random candidates
+        whose feasibility the precisions disagree on.
+    """
+    exact, rough = (agent.planner(spec, **(options | {"precision": precision})) for precision in ("fp32", "bf16"))
+    errors, disagreeing = [], []
+    space = exact.action_spec.space
+    for frame in frames:
+        latent = exact.encode(TensorDict({"pixels": frame[None].to(space.low.device)}, [1]))
+        noise = exact.draw_noise(1)
+        plans = torch.cat([planner.plan(latent, noise=noise).actions for planner in (exact, rough)])[None]
+        drawn = ImaginationNoise(noise.members[0], noise.dynamics[0][:, :, :, :1])
+        threshold = torch.full((1, 1), exact.safe_set_threshold, device=latent.device)
+        one, other = exact.judge(exact.imagine(latent, plans, drawn), threshold).score[0]
+        errors.append(float((one - other).abs() / one.abs().clamp(min=1.0)))
+        uniform = torch.rand(1, exact.cem.num_candidates, exact.horizon, *space.low.shape, device=latent.device)
+        candidates = space.low + (space.high - space.low) * uniform
+        verdicts = [p.judge(p.imagine(latent, candidates, drawn), threshold).feasible for p in (exact, rough)]
+        disagreeing.append(float((verdicts[0] != verdicts[1]).float().mean()))
+    return {"value_error": median(errors), "feasibility": fmean(disagreeing)}
 
 
 def updates(bench: Bench, preset: DictConfig, action_dim: int, device: torch.device, *, plain: bool) -> None:
@@ -225,7 +259,19 @@ def run(config: DictConfig) -> dict:
         if "gflops" in row:
             peak = peaks["bfloat16" if row["what"].endswith("bf16") else "float32"] / 1e9
             row["share_of_peak"] = row["gflops"] / peak
+    agreeing = {}
+    if config.agent is not None:
+        trained = LS3Agent.load(config.agent, device=device)
+        frames = episodes["pixels"].flatten(0, 1)
+        frames = frames[torch.linspace(0, len(frames) - 1, config.states).long()]
+        options = {str(key): value for key, value in presets[0].planner.items()}
+        agreeing = agreement(trained, options, flat, frames)
+        console.print(
+            f"bf16 for fp32: value off by {agreeing['value_error']:.2%}, other feasibility for "
+            f"{agreeing['feasibility']:.2%} of candidates"
+        )
     out = {
+        "agreement": agreeing,
         "hardware": hardware(device),
         "peak_gflops": {name: peak / 1e9 for name, peak in peaks.items()},
         "rows": bench.rows,

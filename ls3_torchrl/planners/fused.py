@@ -23,8 +23,10 @@ from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, Sa
 Precision = Literal["auto", "fp32", "bf16"]
 #: A network's layers: weight ``[out, in]`` and bias ``[out]``, ReLU between them.
 Layers = list[tuple[Tensor, Tensor]]
-#: Candidates under which a part is not worth a core of its own.
-_SMALLEST_PART = 400
+#: Particles of plans under which a part is not worth a core of its own.
+_SMALLEST_PART = 1024
+#: Members that move particles at one step, each with the particles it moves.
+Groups = list[tuple[int, Tensor]]
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
@@ -52,6 +54,10 @@ def _members_of(network: EnsembleMLP, dtype: torch.dtype) -> list[Layers]:
         ]
         for m in range(network.num_members)
     ]
+
+
+def _by_member(members: Tensor) -> Groups:
+    return [(m, (members == m).nonzero().flatten()) for m in members.unique().tolist()]
 
 
 def _same(one: Tensor, other: Tensor) -> bool:
@@ -125,9 +131,9 @@ def _side_by_side(job: Callable[[Job], Result], items: Sequence[Job], workers: i
 class FusedImagination:
     """The same statistics as :class:`~ls3_torchrl.planners.RolloutImagination`, many times faster.
 
-    It works on a snapshot of the weights, taken anew whenever a parameter has changed since. Blocks
-    of candidates are spread over the cores, their particles carried in groups: memory grows with N alone. Latents
-    stay float32; the layers run in ``precision``.
+    It works on a snapshot of the weights, taken anew whenever a parameter has changed since. Plans of all rows lie one
+    after another and are judged in blocks, spread over the cores: memory grows with the block, not with B x N x P.
+    Latents stay float32; the layers run in ``precision``.
 
     Args:
         env: the learned model; its networks must be those of :mod:`ls3_torchrl.modules`.
@@ -136,7 +142,7 @@ class FusedImagination:
         constraint_reduction: over particles, ``"max"`` or ``"mean"``.
         safe_set_reduction: over particles, ``"mean"`` or ``"min"``.
         precision: ``"fp32"``, ``"bf16"``, or ``"auto"`` for what a short measurement finds faster here.
-        block: particles of candidates that are carried and judged together.
+        block: particles that are carried and judged together.
 
     Raises:
         ValueError: for an unknown precision.
@@ -152,7 +158,7 @@ class FusedImagination:
         constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
         precision: Precision = "auto",
-        block: int = 1024,
+        block: int = 4096,
     ) -> None:
         require_choice(precision, ("auto", "fp32", "bf16"), "precision")
         if not self.supports(env, value, safe_set):
@@ -166,7 +172,8 @@ class FusedImagination:
         self.precision = precision
         self.block = block
         self._seen: list[Tensor] = []
-        self._dynamics: Layers = []  # stacked over members: weights [M, in, out], biases [M, 1, out]
+        self._members: list[Layers] = []  # the dynamics, one member after another
+        self._stacked: Layers = []  # the dynamics in weights [M, in, out] and biases [M, 1, out]
         self._value: list[Layers] = []
         self._heads: dict[str, Layers] = {}
 
@@ -191,7 +198,8 @@ class FusedImagination:
         chosen = fastest_precision(device.type) if self.precision == "auto" else self.precision
         self._dtype = torch.bfloat16 if chosen == "bf16" else torch.float32
         network = self.env.dynamics.network
-        self._dynamics = [
+        self._members = _members_of(network, self._dtype)
+        self._stacked = [
             (weight.detach().to(self._dtype).clone(), bias.detach().to(self._dtype).clone())
             for weight, bias in zip(network.weights, network.biases, strict=True)
         ]
@@ -218,55 +226,49 @@ class FusedImagination:
         """
         self.refresh()
         b, n, horizon, _ = actions.shape
+        particles, plans = noise.members.shape[1], b * n
         workers = torch.get_num_threads() if latent.device.type == "cpu" else 1
-        # Parts depend on N and the number of workers alone: a row's plan is the same, bit for bit, in any batch.
-        size = min(self.block, max(-(-n // workers), _SMALLEST_PART))
-        parts = [(row, slice(start, min(start + size, n))) for row in range(b) for start in range(0, n, size)]
+        share = max(-(-plans // workers), -(-_SMALLEST_PART // particles))
+        size = max(1, min(self.block // particles, share))
+        parts = [slice(start, min(start + size, plans)) for start in range(0, plans, size)]
+        # Rows of the batch lie one after another: a part may hold plans of several.
+        row_of = torch.arange(b, device=latent.device).repeat_interleave(n)
+        steps = actions.reshape(plans, horizon, -1).transpose(0, 1)
+        groups = [_by_member(members) for members in noise.members] if latent.device.type == "cpu" else None
 
-        def judge(job: tuple[int, slice]) -> PlanStatistics:
-            row, part = job
-            shared = noise.noise.shape[3] == 1
-            step_noise = noise.noise[row] if shared else noise.noise[row, :, :, part]
-            plan = actions[row, part].transpose(0, 1).contiguous()
-            own = None if limits is None else limits._replace(safe_set_threshold=limits.safe_set_threshold[row])
-            return self._judge(latent[row], plan, noise.members, step_noise, own)
+        def judge(part: slice) -> PlanStatistics:
+            rows = row_of[part]
+            alone = bool(part.start // n == (part.stop - 1) // n)
+            first = int(part.start // n)
+            if noise.noise.shape[3] == 1:
+                drawn = noise.noise[first] if alone else noise.noise[rows, :, :, 0].permute(1, 2, 0, 3)
+            else:
+                drawn = noise.noise.permute(1, 2, 0, 3, 4).flatten(2, 3)[:, :, part]
+            own = None if limits is None else limits._replace(safe_set_threshold=limits.safe_set_threshold[rows])
+            start = latent[first : first + 1] if alone else latent[rows]
+            return self._judge(start, steps[:, part].contiguous(), noise.members, groups, drawn, own)
 
-        out = PlanStatistics(
-            value=latent.new_empty(b, n, len(self._value)),
-            goal_prob=latent.new_empty(b, n, horizon),
-            constraint_prob=latent.new_empty(b, n, horizon),
-            safe_set_prob=latent.new_empty(b, n),
-        )
-        for (row, part), found in zip(parts, _side_by_side(judge, parts, workers), strict=True):
-            for whole, piece in zip(out, found, strict=True):
-                whole[row, part] = piece
-        return out
+        found = _side_by_side(judge, parts, workers)
+        return PlanStatistics(*(torch.cat(pieces).unflatten(0, (b, n)) for pieces in zip(*found, strict=True)))
 
     @torch.no_grad()
     def _judge(
-        self, latent: Tensor, plan: Tensor, members: Tensor, noise: Tensor, limits: Limits | None
+        self,
+        latent: Tensor,
+        plan: Tensor,
+        members: Tensor,
+        groups: list[Groups] | None,
+        noise: Tensor,
+        limits: Limits | None,
     ) -> PlanStatistics:
-        """Statistics of the plans ``[H, R, A]`` from one latent ``[D]`` under noise ``[H, P, R or 1, D]``."""
+        """Statistics of the plans ``[H, R, A]`` from latents ``[R or 1, D]`` under noise ``[H, P, R or 1, D]``."""
         horizon, r, _ = plan.shape
         particles = noise.shape[1]
-        constraint = latent.new_zeros(r, horizon)
-        safe = latent.new_full((r,), float(self.safe_set_reduction == "min"))
-        group = max(1, self.block // r)
-        groups = []
-        for first in range(0, particles, group):
-            chosen = slice(first, min(first + group, particles))
-            states = self._carry(latent, plan, members[:, chosen], noise[:, chosen])
-            groups.append(states)
-            violating = self._probability("constraint", states)
-            if self.constraint_reduction == "max":
-                constraint = torch.maximum(constraint, violating.amax(0).T)
-            else:
-                constraint += violating.sum(0).T / particles
-            in_safe_set = self._probability("safe_set", states[:, -1])
-            if self.safe_set_reduction == "min":
-                safe = torch.minimum(safe, in_safe_set.amin(0))
-            else:
-                safe += in_safe_set.sum(0) / particles
+        path = self._carry(latent, plan, members, groups, noise)
+        violating = torch.stack([self._probability("constraint", states) for states in path], -1)  # [P, R, H]
+        constraint = violating.amax(0) if self.constraint_reduction == "max" else violating.mean(0)
+        in_safe_set = self._probability("safe_set", path[-1])
+        safe = in_safe_set.amin(0) if self.safe_set_reduction == "min" else in_safe_set.mean(0)
 
         value, goal = latent.new_full((r, len(self._value)), torch.nan), latent.new_full((r, horizon), torch.nan)
         found = PlanStatistics(value, goal, constraint, safe)
@@ -274,20 +276,17 @@ class FusedImagination:
         if limits is not None:
             allowed = feasible(
                 found,
-                safe_set_threshold=limits.safe_set_threshold,
+                safe_set_threshold=limits.safe_set_threshold.squeeze(-1),
                 constraint_threshold=limits.constraint_threshold,
             )
             wanted = allowed.nonzero().flatten()
         if not len(wanted):
             return found
-        values, goals = value.new_zeros(len(wanted), value.shape[1]), goal.new_zeros(len(wanted), horizon)
-        for states in groups:
-            kept = states if len(wanted) == r else states[:, :, wanted]
-            goals += self._probability("goal", kept).sum(0).T
-            ends = kept[:, -1].reshape(-1, kept.shape[-1])
-            for m, layers in enumerate(self._value):
-                values[:, m] += run_layers(ends, layers).float().reshape(-1, len(wanted)).sum(0)
-        value[wanted], goal[wanted] = values / particles, goals / particles
+        kept = path if len(wanted) == r else [states[:, wanted] for states in path]
+        goal[wanted] = torch.stack([self._probability("goal", states).mean(0) for states in kept], -1)
+        ends = kept[-1].reshape(-1, kept[-1].shape[-1])
+        values = [run_layers(ends, layers).float().reshape(particles, -1).mean(0) for layers in self._value]
+        value[wanted] = torch.stack(values, -1)
         return found
 
     def _probability(self, head: str, states: Tensor) -> Tensor:
@@ -295,23 +294,40 @@ class FusedImagination:
         logit = run_layers(states.reshape(-1, states.shape[-1]), self._heads[head])
         return logit.float().sigmoid().reshape(states.shape[:-1])
 
-    def _carry(self, latent: Tensor, plan: Tensor, members: Tensor, noise: Tensor) -> Tensor:
-        """G particles of every plan ``[H, R, A]``: the latents ``[G, H, R, D]`` they visit, in layer precision.
-
-        Members ``[H, G]`` pick the weights that move each particle; noise is ``[H, G, R or 1, D]``.
-        """
+    def _carry(
+        self, latent: Tensor, plan: Tensor, members: Tensor, groups: list[Groups] | None, noise: Tensor
+    ) -> list[Tensor]:
+        """P particles of every plan ``[H, R, A]``: the latents ``[P, R, D]`` they visit, in layer precision."""
         dynamics = self.env.dynamics
         particles, rows = members.shape[1], plan.shape[1]
         state = latent.expand(particles, rows, -1)
-        last = len(self._dynamics) - 1
         path = []
-        for action, member, step_noise in zip(plan, members, noise, strict=True):
+        for t, action in enumerate(plan):
             x = dynamics.network_input(state, action.expand(particles, -1, -1)).to(self._dtype)
-            for i, (weight, bias) in enumerate(self._dynamics):
-                x = torch.baddbmm(bias[member], x, weight[member])
-                if i < last:
-                    x = x.relu_()
-            delta, log_scale = dynamics.read_output(x.float(), action)
-            state = torch.addcmul(state + delta, log_scale.exp(), step_noise.expand_as(delta))
+            output = self._move_together(x, members[t]) if groups is None else self._move_by_member(x, groups[t])
+            delta, log_scale = dynamics.read_output(output.float(), action)
+            state = torch.addcmul(state + delta, log_scale.exp(), noise[t].expand_as(delta))
             path.append(state.to(self._dtype))
-        return torch.stack(path, 1)
+        return path
+
+    def _move_by_member(self, x: Tensor, groups: Groups) -> Tensor:
+        """The dynamics' output for particles ``[P, R, in]``, one member and all of its particles at a time."""
+        output = None
+        for member, which in groups:
+            mine = x[which] if len(groups) > 1 else x
+            moved = run_layers(mine.reshape(-1, x.shape[-1]), self._members[member]).reshape(*mine.shape[:-1], -1)
+            if len(groups) == 1:
+                return moved
+            output = moved.new_empty(*x.shape[:-1], moved.shape[-1]) if output is None else output
+            output[which] = moved
+        assert output is not None
+        return output
+
+    def _move_together(self, x: Tensor, member: Tensor) -> Tensor:
+        """The same in batched products with gathered weights: nothing here waits for the device."""
+        last = len(self._stacked) - 1
+        for i, (weight, bias) in enumerate(self._stacked):
+            x = torch.baddbmm(bias[member], x, weight[member])
+            if i < last:
+                x = x.relu_()
+        return x

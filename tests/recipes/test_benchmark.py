@@ -60,3 +60,17 @@ def test_the_plain_vae_has_the_layers_of_the_agents():
     kinds = {type(layer) for layer in plain.modules() if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d))}
     assert kinds == {nn.Conv2d, nn.ConvTranspose2d}
     assert plain.loss(torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).isfinite()
+
+
+def test_agreement_is_perfect_with_itself_and_told_apart_otherwise(monkeypatch):
+    torch.manual_seed(0)
+    agent = LS3Agent(2, latent_dim=4, value_hidden=[32], classifier_hidden=[32], dynamics_hidden=[32])
+    spec = Bounded(low=-1.0, high=1.0, shape=(2,))
+    options = {"num_candidates": 60, "num_elites": 6, "num_particles": 2, "horizon": 3, "safe_set_threshold": 0.5}
+    frames = torch.randint(256, (4, 3, 64, 64), dtype=torch.uint8)
+    found = benchmark.agreement(agent, options, spec, frames)
+    assert 0.0 <= found["value_error"] < 0.2
+    assert 0.0 <= found["feasibility"] < 0.5
+    plan = LS3Agent.planner
+    monkeypatch.setattr(LS3Agent, "planner", lambda self, spec, **o: plan(self, spec, **(o | {"precision": "fp32"})))
+    assert benchmark.agreement(agent, options, spec, frames) == {"value_error": 0.0, "feasibility": 0.0}
