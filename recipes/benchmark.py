@@ -96,9 +96,9 @@ def agreement(agent: LS3Agent, options: dict[str, Any], spec: Bounded, frames: T
         frames: images ``[n, C, 64, 64]`` to plan from.
 
     Returns:
-        ``value_error``: median over images of how far, relatively, the value of the plan chosen in bf16 lies from that
-        of the plan chosen in fp32, both judged in fp32 under the same noise. ``feasibility``: share of random candidates
-        whose feasibility the precisions disagree on.
+        ``value_error``: median over images of how far, relatively, the value of the plan chosen in bf16 lies from
+        that of the plan chosen in fp32, both judged in fp32 under the same noise. ``feasibility``: share of random
+        candidates whose feasibility the precisions disagree on.
     """
     exact, rough = (agent.planner(spec, **(options | {"precision": precision})) for precision in ("fp32", "bf16"))
     errors, disagreeing = [], []
