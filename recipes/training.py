@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.objectives import HardUpdate, LossModule
 
-from common import RunFolder, progress
+from common import RunFolder, console, progress
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import ALL_TAGS, VALUE_TAGS, Tag, TaggedReplayBuffer, random_resized_crop
 from ls3_torchrl.objectives import (
@@ -71,10 +71,8 @@ def check_settings(config: DictConfig) -> None:
         "online.episodes_per_update": config.online.episodes_per_update,
         "evaluation.episodes": config.evaluation.episodes,
     }
-    shares = {"vae.beta_warmup": vae.beta_warmup}
-    for name, value in shares.items():
-        if not 0.0 <= value <= 1.0:
-            raise ValueError(f"{name} must lie in [0, 1], got {value}.")
+    if vae.warmup is not None and not (len(vae.warmup) == 2 and 0.0 <= vae.warmup[0] < vae.warmup[1] <= 1.0):
+        raise ValueError(f"vae.warmup must be null or rising shares of the steps [start, end], got {vae.warmup}.")
     loss = config.loss
     for name in ("failure_weight", "undecided_weight"):
         if loss[name] < 0.0:
@@ -97,6 +95,14 @@ def check_settings(config: DictConfig) -> None:
     rows = config.task.buffer_capacity
     if rows < 1:
         raise ValueError(f"task.buffer_capacity must be at least 1, got {rows}.")
+
+
+def warmed_up(share: float, warmup: Sequence[float] | None) -> float:
+    """What a weight has risen to after a share of the steps: from 0 at the start of ``warmup`` to 1 at its end."""
+    if warmup is None:
+        return 1.0
+    start, end = warmup
+    return min(max((share - start) / (end - start), 0.0), 1.0)
 
 
 class Term(NamedTuple):
@@ -278,7 +284,7 @@ class Training:
         draw = self.buffer.sample_pixel_transitions if weight else self.buffer.sample_pixels
         with threads(options.threads), progress(options.steps, "VAE") as bar:
             for i in range(options.steps):
-                warmth = min(1.0, (i + 1) / max(options.beta_warmup * options.steps, 1.0))
+                warmth = warmed_up((i + 1) / options.steps, options.warmup)
                 loss.beta = options.beta * warmth
                 batch = draw(options.batch_size).to(device).rename_key_("pixels", "target_pixels")
                 target = batch["target_pixels"]
@@ -301,6 +307,7 @@ class Training:
                     bar.set_postfix_str(f"error {scalars['reconstruction']:.2e}", refresh=False)
                     self.run.log("VAE", i, **scalars)
                 bar.update()
+        self._warn_of_collapse(scalars["reconstruction"])
         agent.encoder.requires_grad_(False)
         agent.decoder.requires_grad_(False)
         self._encode()
@@ -309,6 +316,18 @@ class Training:
             agent.encoder.rescale(1.0 / spread)
             agent.decoder.rescale(1.0 / spread)
             self._encode()
+
+    def _warn_of_collapse(self, error: float) -> None:
+        """Say so when the VAE draws little more than the mean of all images: nothing can be learnt from its latents."""
+        if self.config.vae.reduction != "mean":
+            return
+        images = self.buffer.sample_pixels(512)["pixels"].float() / 255.0
+        variance = float((images - images.mean(0)).square().mean())
+        if error > 0.6 * variance:
+            console.print(
+                f"[bold red]The VAE hardly sees what moves[/bold red]: its squared error is {error:.1e}, that of the "
+                f"mean image {variance:.1e}. Train it longer (vae.steps), warmer (vae.lr), or raise beta later (vae.warmup)."
+            )
 
     def _encode(self) -> None:
         """Encode every frame."""

@@ -206,9 +206,12 @@ def test_the_prediction_term_trains_the_dynamics_beside_the_vae_by_its_weight(co
     assert not torch.equal(heads[2], heads[3])
 
 
-@pytest.mark.parametrize(("warmup", "shares"), [(0.0, [1.0, 1.0, 1.0, 1.0]), (0.75, [1 / 3, 2 / 3, 1.0, 1.0])])
+@pytest.mark.parametrize(
+    ("warmup", "shares"),
+    [(None, [1.0, 1.0, 1.0, 1.0]), ([0.0, 0.75], [1 / 3, 2 / 3, 1.0, 1.0]), ([0.25, 0.75], [0.0, 0.5, 1.0, 1.0])],
+)
 def test_beta_rises_over_its_share_of_the_steps(config, monkeypatch, warmup, shares):
-    OmegaConf.update(config, "vae", {"steps": 4, "batch_size": 2, "beta": 0.3, "beta_warmup": warmup})
+    OmegaConf.update(config, "vae", {"steps": 4, "batch_size": 2, "beta": 0.3, "warmup": warmup})
     agent = LS3Agent(action_dim=2, **config.agent)
     buffer = TaggedReplayBuffer(20, latent_dim=config.agent.latent_dim)
     step = {"reward": -torch.ones(3, 1), "pixels": torch.zeros(3, 3, 64, 64, dtype=torch.uint8)}
@@ -218,6 +221,19 @@ def test_beta_rises_over_its_share_of_the_steps(config, monkeypatch, warmup, sha
     monkeypatch.setattr(VAELoss, "forward", lambda self, td: (seen.append(self.beta), forward(self, td))[1])
     Training(agent, buffer, config, Silent()).train_vae()
     assert seen == pytest.approx([0.3 * share for share in shares])
+
+
+@pytest.mark.parametrize(("error", "warned"), [(0.9, True), (0.3, False)])
+def test_a_vae_that_draws_the_mean_image_is_noticed(config, capsys, error, warned):
+    agent = LS3Agent(action_dim=2, **config.agent)
+    buffer = TaggedReplayBuffer(20, latent_dim=config.agent.latent_dim)
+    pixels = (torch.arange(20) % 2 * 255).to(torch.uint8)[:, None, None, None].expand(-1, 3, 64, 64).contiguous()
+    step = {"reward": -torch.ones(19, 1), "pixels": pixels[1:]}
+    step |= {k: torch.zeros(19, 1, dtype=torch.bool) for k in ("constraint", "success")}
+    buffer.add(TensorDict({"pixels": pixels[:-1], "action": torch.zeros(19, 2), "next": step}, [19]), "success")
+    # Black and white images in turn: their variance about the mean image is a quarter.
+    Training(agent, buffer, config, Silent())._warn_of_collapse(0.25 * error)
+    assert ("hardly sees" in capsys.readouterr().out) == warned
 
 
 def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_horizon(config):
@@ -231,7 +247,8 @@ def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_horizon(conf
     ("name", "value"),
     [
         ("vae.schedule", "cosine"),
-        ("vae.beta_warmup", 1.5),
+        ("vae.warmup", [0.5, 0.5]),
+        ("vae.warmup", [0.5, 1.5]),
         ("vae.prediction_weight", -1.0),
         ("vae.autocast", "bf16"),
         ("loss.failure_weight", -0.1),
