@@ -326,7 +326,7 @@ class Training:
         if error > 0.6 * variance:
             console.print(
                 f"[bold red]The VAE hardly sees what moves[/bold red]: its squared error is {error:.1e}, that of the "
-                f"mean image {variance:.1e}. Train it longer (vae.steps), warmer (vae.lr), or raise beta later (vae.warmup)."
+                f"mean image {variance:.1e}. Try more vae.steps, a warmer vae.lr, or a later vae.warmup."
             )
 
     def _encode(self) -> None:
