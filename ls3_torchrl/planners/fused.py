@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Literal, TypeVar
 
@@ -172,6 +173,7 @@ class FusedImagination:
         self.precision = precision
         self.block = block
         self._seen: list[Tensor] = []
+        self._steady = False
         self._members: list[Layers] = []  # the dynamics, one member after another
         self._stacked: Layers = []  # the dynamics in weights [M, in, out] and biases [M, 1, out]
         self._value: list[Layers] = []
@@ -215,6 +217,16 @@ class FusedImagination:
         self._seen = [p.detach().clone() for p in parameters]
         return True
 
+    @contextmanager
+    def steady(self) -> Iterator[None]:
+        """Look for changed parameters now, and not again before the end: for several calls in a row, as in one plan."""
+        self.refresh()
+        self._steady = True
+        try:
+            yield
+        finally:
+            self._steady = False
+
     @torch.no_grad()
     def __call__(
         self, latent: Tensor, actions: Tensor, noise: ImaginationNoise, limits: Limits | None = None
@@ -224,7 +236,8 @@ class FusedImagination:
         With ``limits``, plans that are not feasible under them get neither values nor goal probabilities (NaN): the
         planner masks their scores anyway, and most plans of a first round are not.
         """
-        self.refresh()
+        if not self._steady:
+            self.refresh()
         b, n, horizon, _ = actions.shape
         particles, plans = noise.members.shape[1], b * n
         workers = torch.get_num_threads() if latent.device.type == "cpu" else 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple, Protocol
 
 import torch
@@ -63,6 +64,9 @@ class Limits(NamedTuple):
 class Imagination(Protocol):
     """Imagines candidate plans and reduces what it sees over the particles."""
 
+    def steady(self) -> AbstractContextManager[None]:
+        """Within it no parameter changes, so that work on them need be done only once."""
+
     def __call__(
         self, latent: Tensor, actions: Tensor, noise: ImaginationNoise, limits: Limits | None = None
     ) -> PlanStatistics:
@@ -115,6 +119,10 @@ class RolloutImagination:
         self.env, self.value, self.safe_set = env, value, safe_set
         self.constraint_reduction = constraint_reduction
         self.safe_set_reduction = safe_set_reduction
+
+    def steady(self) -> AbstractContextManager[None]:
+        """Nothing is kept of the parameters here, so nothing can go stale."""
+        return nullcontext()
 
     @torch.no_grad()
     def __call__(

@@ -266,16 +266,17 @@ class LS3Planner(MPCPlannerBase):
                 return self._draw_candidates(rows, population)
             return noise.normal[population][rows], noise.uniform[population][rows]
 
-        return self.cem(
-            evaluate,
-            space.low,
-            space.high,
-            batch=latent.shape[0],
-            horizon=self.horizon,
-            mean=mean,
-            std=std,
-            noise=candidates,
-        )
+        with self.imagine.steady():
+            return self.cem(
+                evaluate,
+                space.low,
+                space.high,
+                batch=latent.shape[0],
+                horizon=self.horizon,
+                mean=mean,
+                std=std,
+                noise=candidates,
+            )
 
     def _threshold(self, restarts: Tensor) -> Tensor:
         return self.safe_set_threshold * self.relaxation ** restarts.to(torch.float32)

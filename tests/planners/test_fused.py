@@ -97,6 +97,26 @@ def test_a_snapshot_is_taken_only_when_something_changed():
     assert imagine.refresh() is False
 
 
+def test_within_a_steady_stretch_changes_are_looked_for_once_and_again_after_it():
+    parts = build()
+    imagine = fused_of(parts, precision="fp32")
+    looked = []
+    refresh = imagine.refresh
+    imagine.refresh = lambda: looked.append(refresh())
+    with imagine.steady():
+        first = imagine(*problem())
+        imagine(*problem())
+    assert looked == [True]
+    with torch.no_grad():
+        parts["safe_set"].network[-1].bias += 3.0
+    with pytest.raises(RuntimeError, match="in between"), imagine.steady():
+        assert looked == [True, True]
+        raise RuntimeError("in between")
+    after = imagine(*problem())
+    assert looked == [True, True, False]
+    assert (after.safe_set_prob > first.safe_set_prob).all()
+
+
 @pytest.mark.parametrize("fused", [False, True], ids=["Adam", "fused Adam"])
 @pytest.mark.parametrize("name", NAMES)
 def test_weights_after_an_optimiser_step_are_used(name, fused):
