@@ -1,3 +1,5 @@
+from contextlib import suppress
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -109,9 +111,8 @@ def test_within_a_steady_stretch_changes_are_looked_for_once_and_again_after_it(
     assert looked == [True]
     with torch.no_grad():
         parts["safe_set"].network[-1].bias += 3.0
-    with pytest.raises(RuntimeError, match="in between"), imagine.steady():
-        assert looked == [True, True]
-        raise RuntimeError("in between")
+    with suppress(RuntimeError), imagine.steady():
+        raise RuntimeError("an error in between must not leave it steady")
     after = imagine(*problem())
     assert looked == [True, True, False]
     assert (after.safe_set_prob > first.safe_set_prob).all()
