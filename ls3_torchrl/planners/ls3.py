@@ -33,6 +33,7 @@ from ls3_torchrl.planners.imagination import (
 from ls3_torchrl.planners.latent_env import LatentEnv
 from ls3_torchrl.planners.scoring import (
     ConstraintReduction,
+    GoalReduction,
     PlanStatistics,
     SafeSetReduction,
     feasible,
@@ -77,6 +78,8 @@ class LS3Planner(MPCPlannerBase):
         safe_set_reduction: over particles, ``"mean"`` as the authors' code or ``"min"``: every particle must end
             in the safe set. A mean of δ_S lets a share 1 − δ_S of the particles end anywhere, and a plan gains from
             sending them where the value is overestimated.
+        goal_reduction: over imagined steps, ``"count"`` of those that are more likely in the goal than not, as the
+            authors' code, or ``"expected"``, the sum of the probabilities.
         pessimism: κ ≥ 0, subtracts κ standard deviations over the value ensemble; 0 is the paper.
         common_noise: judge all candidates of a row by the same particles (common random numbers), which
             compares them with less variance; ``False`` draws noise for each.
@@ -134,6 +137,7 @@ class LS3Planner(MPCPlannerBase):
         p_constant: float = 0.0,
         constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
+        goal_reduction: GoalReduction = "count",
         pessimism: float = 0.0,
         common_noise: bool = True,
         noise_scale: float = 1.0,
@@ -162,6 +166,8 @@ class LS3Planner(MPCPlannerBase):
             raise ValueError(f"pessimism must not be negative, got {pessimism}.")
         if noise_scale < 0.0:
             raise ValueError(f"noise_scale must not be negative, got {noise_scale}.")
+        require_choice(goal_reduction, ("count", "expected"), "goal_reduction")
+        self.goal_reduction: GoalReduction = goal_reduction
         self.pessimism = pessimism
         self.noise_scale = noise_scale
         self.common_noise = common_noise
@@ -229,7 +235,7 @@ class LS3Planner(MPCPlannerBase):
     def judge(self, statistics: PlanStatistics, threshold: Tensor) -> Judgement:
         """Objective, feasibility and fallback ranking of candidates under δ_S ``[b, 1]``."""
         return Judgement(
-            objective(statistics, pessimism=self.pessimism),
+            objective(statistics, pessimism=self.pessimism, goal_reduction=self.goal_reduction),
             feasible(statistics, safe_set_threshold=threshold, constraint_threshold=self.constraint_threshold),
             least_harm(statistics, constraint_threshold=self.constraint_threshold),
         )

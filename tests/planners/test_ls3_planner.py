@@ -578,6 +578,7 @@ def test_probabilities_must_lie_strictly_between_zero_and_one(name, value):
         ({"pessimism": -1.0}, "pessimism must not be negative"),
         ({"noise_scale": -0.1}, "noise_scale must not be negative, got -0.1"),
         ({"min_std": -1.0}, "min_std must not be negative"),
+        ({"goal_reduction": "sum"}, "goal_reduction must be one of 'count', 'expected'; got 'sum'"),
         ({"engine": "jax"}, "engine must be one of 'auto', 'fused', 'rollout'; got 'jax'"),
         ({"precision": "fp8"}, "precision must be one of 'auto', 'fp32', 'bf16'; got 'fp8'"),
         ({"constraint_reduction": "min"}, "constraint_reduction must be one of 'max', 'mean'; got 'min'"),
