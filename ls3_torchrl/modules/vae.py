@@ -59,14 +59,22 @@ class _Conv2d(nn.Conv2d):
 
 
 class _ConvTranspose2d(nn.ConvTranspose2d):
-    """A transposed convolution that is one matrix product where the input is a single pixel."""
+    """A transposed convolution, the same result in less time.
+
+    One matrix product where the input is a single pixel. The bias is added outside: on CPUs PyTorch spends more time on
+    its gradient inside than on those of input and weights together.
+    """
 
     def forward(self, input: Tensor, output_size: list[int] | None = None) -> Tensor:
-        if tuple(input.shape[-2:]) != (1, 1) or output_size is not None:
+        if output_size is not None:
             return super().forward(input, output_size)
         assert self.bias is not None
-        image = (input.flatten(1) @ self.weight.flatten(1)).unflatten(-1, self.weight.shape[1:])
-        return (image + self.bias[:, None, None]).contiguous(memory_format=torch.channels_last)
+        if tuple(input.shape[-2:]) == (1, 1):
+            image = (input.flatten(1) @ self.weight.flatten(1)).unflatten(-1, self.weight.shape[1:])
+            image = image.contiguous(memory_format=torch.channels_last)
+        else:
+            image = nn.functional.conv_transpose2d(input, self.weight, None, self.stride)
+        return image + self.bias.to(image.dtype)[:, None, None]
 
 
 class _ConvolutionalPosterior(nn.Module):
@@ -216,11 +224,11 @@ class PixelDecoder(TensorDictModuleBase):
             nn.Unflatten(-1, (_FEATURES, 1, 1)),
             _ConvTranspose2d(_FEATURES, 128, 5, stride=2),
             nn.ReLU(),
-            nn.ConvTranspose2d(128, 64, 5, stride=2),
+            _ConvTranspose2d(128, 64, 5, stride=2),
             nn.ReLU(),
-            nn.ConvTranspose2d(64, 32, 6, stride=2),
+            _ConvTranspose2d(64, 32, 6, stride=2),
             nn.ReLU(),
-            nn.ConvTranspose2d(32, out_channels, 6, stride=2),
+            _ConvTranspose2d(32, out_channels, 6, stride=2),
         )
 
     @torch.no_grad()

@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch.distributions import Normal, kl_divergence
+from torch.nn.functional import mse_loss
 from torchrl.objectives import LossModule
 
 from ls3_torchrl._checks import require_choice, require_keys
@@ -94,19 +95,20 @@ class VAELoss(LossModule):
         target = as_unit_pixels(tensordict.get(target_key), pixels.shape[-3])
 
         params = tensordict.empty()
-        params.set(self.encoder.pixels_key, pixels)
+        # Floats in [0, 1] are as good to the encoder; the same images need not be converted twice.
+        params.set(self.encoder.pixels_key, target if target_key == keys.pixels else pixels)
         self.encoder[0](params)
         posterior = Normal(params.get(self.encoder.loc_key), params.get(self.encoder.scale_key))
         params.set(self.decoder.in_keys[0], posterior.rsample())
         reconstruction = self.decoder(params).get(self.decoder.out_keys[0])
 
         # No clamp on the reconstruction: it would stop the gradient of every pixel that starts below zero.
-        squared_error = (reconstruction - target).square().flatten(-3)
         kl = kl_divergence(posterior, Normal(torch.zeros_like(posterior.loc), torch.ones_like(posterior.scale)))
         if self.reduction == "mean":
-            error, divergence = squared_error.mean(), kl.mean()
+            error, divergence = mse_loss(reconstruction, target), kl.mean()
         else:
-            error, divergence = squared_error.sum(-1).mean(), kl.sum(-1).mean()
+            error = mse_loss(reconstruction, target, reduction="sum") / kl[..., 0].numel()
+            divergence = kl.sum(-1).mean()
         return as_scalars(
             loss_vae=error + self.beta * divergence,
             reconstruction=error.detach(),
