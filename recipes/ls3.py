@@ -88,6 +88,7 @@ def train(config: DictConfig) -> dict:
             latent_dim=config.agent.latent_dim,
             gamma=config.loss.gamma,
             continue_failures=config.loss.continue_failures,
+            scratch_dir=config.scratch_dir,
             device=device,
         )
         for tag, episodes in offline.items():

@@ -237,7 +237,7 @@ class TaggedReplayBuffer:
         """
         if self._encoder is None:
             raise RuntimeError("The buffer has no latents yet: call buffer.encode(encoder) after training the VAE.")
-        rows = self.view(tags).sample(batch_size * (members or 1))
+        rows = self.view(tags).sample(batch_size * (members or 1)).to(self.device)
         for group in (rows, rows.get("next")):
             loc = group.get("loc")
             group.set("latent", torch.addcmul(loc, group.get("scale"), torch.randn_like(loc)))
@@ -250,10 +250,11 @@ class TaggedReplayBuffer:
         """
         rows = self.view(tags).sample(batch_size)
         before, after = (self.pixels.storage[slot]["pixels"] for slot in self._slots(rows["frame"]))
-        return TensorDict({"pixels": before, "action": rows["action"], "next": {"pixels": after}}, [batch_size])
+        batch = TensorDict({"pixels": before, "action": rows["action"], "next": {"pixels": after}}, [batch_size])
+        return batch.to(self.device)
 
     def sample_pixels(self, batch_size: int) -> TensorDictBase:
         """Images ``pixels`` ``[B, C, 64, 64]``, uint8, uniformly from all frames."""
         if len(self.pixels) == 0:
             raise RuntimeError("The buffer holds no images yet: add episodes first.")
-        return self.pixels.sample(batch_size)
+        return self.pixels.sample(batch_size).to(self.device)

@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.data import Bounded
 
 from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
@@ -89,6 +90,61 @@ def test_with_limits_only_what_is_feasible_is_valued_and_nothing_else_changes(sh
     for name in ("value", "goal_prob"):
         torch.testing.assert_close(getattr(part, name)[allowed], getattr(whole, name)[allowed])
         assert getattr(part, name)[~allowed].isnan().all()
+
+
+class LargestTensor(TorchDispatchMode):
+    """Remembers the bytes of the largest tensor that any operation returned."""
+
+    def __init__(self):
+        super().__init__()
+        self.bytes = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        for tensor in out if isinstance(out, (tuple, list)) else [out]:
+            if isinstance(tensor, torch.Tensor) and not func.is_view:
+                self.bytes = max(self.bytes, tensor.nbytes)
+        return out
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_memory_is_that_of_a_block_however_many_plans_there_are(precision, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)  # modes watch their own thread alone
+    torch.manual_seed(0)
+    env = LatentEnv(
+        EnsembleDynamics(32, 2),
+        ConstraintEstimator(32),
+        GoalEstimator(32),
+        action_spec=Bounded(low=-1.0, high=1.0, shape=(A,)),
+    )
+    imagine = FusedImagination(env, ValueEnsemble(32), SafeSet(32), precision=precision, block=512)
+    imagine.refresh()
+    largest = {}
+    for b, n, p in ((1, 50, 20), (1, 400, 20), (4, 100, 20), (1, 100, 200)):
+        members = torch.randint(5, (2, p))
+        noise = ImaginationNoise(members, torch.randn(b, 2, p, 1, 32))
+        with LargestTensor() as seen:
+            imagine(torch.randn(b, 32), torch.rand(b, n, 2, 2), noise)
+        largest[b, n, p] = seen.bytes
+    # The widest layer of a block, in float32: 256 numbers a particle.
+    assert max(largest.values()) <= 512 * 256 * 4
+    assert largest[1, 400, 20] == largest[4, 100, 20]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_the_gpu_imagines_what_the_cpu_does(precision):
+    latent, actions, noise = problem()
+    exact = fused_of(build(), precision="fp32")(latent, actions, noise)
+    parts = {name: module.cuda() for name, module in build().items()}
+    spec = Bounded(low=-1.0, high=1.0, shape=(A,), device="cuda")
+    env = LatentEnv(parts["dynamics"], parts["constraint"], parts["goal"], action_spec=spec, device="cuda")
+    imagine = FusedImagination(env, parts["value"], parts["safe_set"], precision=precision)
+    on_gpu = imagine(latent.cuda(), actions.cuda(), ImaginationNoise(*(part.cuda() for part in noise)))
+    for name, one, other in zip(exact._fields, on_gpu, exact, strict=True):
+        tolerance = (0.01 if precision == "fp32" else 0.05) * max(float(other.abs().max()), float(other.std()))
+        assert (one.cpu() - other).abs().max() < tolerance, name
 
 
 def test_a_snapshot_is_taken_only_when_something_changed():
