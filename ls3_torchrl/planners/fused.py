@@ -24,6 +24,8 @@ from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, Sa
 Precision = Literal["auto", "fp32", "bf16"]
 #: A network's layers: weight ``[out, in]`` and bias ``[out]``, ReLU between them.
 Layers = list[tuple[Tensor, Tensor]]
+#: Particles that are carried together: their widest layer stays in a core's cache, or fills a GPU.
+_CPU_BLOCK, _GPU_BLOCK = 4096, 262_144
 #: Particles of plans under which a part is not worth a core of its own.
 _SMALLEST_PART = 1024
 #: Members that move particles at one step, each with the particles it moves.
@@ -143,7 +145,8 @@ class FusedImagination:
         constraint_reduction: over particles, ``"max"`` or ``"mean"``.
         safe_set_reduction: over particles, ``"mean"`` or ``"min"``.
         precision: ``"fp32"``, ``"bf16"``, or ``"auto"`` for what a short measurement finds faster here.
-        block: particles that are carried and judged together.
+        block: particles that are carried and judged together; by default what stays in a CPU's cache, or what fills a
+            GPU.
 
     Raises:
         ValueError: for an unknown precision.
@@ -159,7 +162,7 @@ class FusedImagination:
         constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
         precision: Precision = "auto",
-        block: int = 4096,
+        block: int | None = None,
     ) -> None:
         require_choice(precision, ("auto", "fp32", "bf16"), "precision")
         if not self.supports(env, value, safe_set):
@@ -240,14 +243,16 @@ class FusedImagination:
             self.refresh()
         b, n, horizon, _ = actions.shape
         particles, plans = noise.members.shape[1], b * n
-        workers = torch.get_num_threads() if latent.device.type == "cpu" else 1
+        on_cpu = latent.device.type == "cpu"
+        workers = torch.get_num_threads() if on_cpu else 1
+        block = self.block or (_CPU_BLOCK if on_cpu else _GPU_BLOCK)
         share = max(-(-plans // workers), -(-_SMALLEST_PART // particles))
-        size = max(1, min(self.block // particles, share))
+        size = max(1, min(block // particles, share))
         parts = [slice(start, min(start + size, plans)) for start in range(0, plans, size)]
         # Rows of the batch lie one after another: a part may hold plans of several.
         row_of = torch.arange(b, device=latent.device).repeat_interleave(n)
         steps = actions.reshape(plans, horizon, -1).transpose(0, 1)
-        groups = [_by_member(members) for members in noise.members] if latent.device.type == "cpu" else None
+        groups = [_by_member(members) for members in noise.members] if on_cpu else None
 
         def judge(part: slice) -> PlanStatistics:
             rows = row_of[part]
@@ -257,7 +262,12 @@ class FusedImagination:
                 drawn = noise.noise[first] if alone else noise.noise[rows, :, :, 0].permute(1, 2, 0, 3)
             else:
                 drawn = noise.noise.permute(1, 2, 0, 3, 4).flatten(2, 3)[:, :, part]
-            own = None if limits is None else limits._replace(safe_set_threshold=limits.safe_set_threshold[rows])
+            # Which plans are feasible is known on the device alone; waiting for it would cost more than valuing them all.
+            own = (
+                None
+                if limits is None or not on_cpu
+                else limits._replace(safe_set_threshold=limits.safe_set_threshold[rows])
+            )
             start = latent[first : first + 1] if alone else latent[rows]
             return self._judge(start, steps[:, part].contiguous(), noise.members, groups, drawn, own)
 
