@@ -243,6 +243,8 @@ class FusedImagination:
             self.refresh()
         b, n, horizon, _ = actions.shape
         particles, plans = noise.members.shape[1], b * n
+        if latent.device.type != "cpu":
+            limits = None  # which plans are feasible is known there alone: asking costs more than valuing them all
         on_cpu = latent.device.type == "cpu"
         workers = torch.get_num_threads() if on_cpu else 1
         block = self.block or (_CPU_BLOCK if on_cpu else _GPU_BLOCK)
@@ -262,12 +264,9 @@ class FusedImagination:
                 drawn = noise.noise[first] if alone else noise.noise[rows, :, :, 0].permute(1, 2, 0, 3)
             else:
                 drawn = noise.noise.permute(1, 2, 0, 3, 4).flatten(2, 3)[:, :, part]
-            # Which plans are feasible is known on the device alone; waiting for it would cost more than valuing them all.
-            own = (
-                None
-                if limits is None or not on_cpu
-                else limits._replace(safe_set_threshold=limits.safe_set_threshold[rows])
-            )
+            own = limits
+            if own is not None:
+                own = own._replace(safe_set_threshold=own.safe_set_threshold[rows])
             start = latent[first : first + 1] if alone else latent[rows]
             return self._judge(start, steps[:, part].contiguous(), noise.members, groups, drawn, own)
 
