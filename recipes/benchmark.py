@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -220,6 +223,14 @@ def vae(bench: Bench, preset: DictConfig, frames: Tensor, device: torch.device, 
         bench.time("encoding a frame", lambda: agent.encoder(encode), per=len(pixels))
 
 
+def smoke_run(task: str) -> None:
+    """The whole recipe, from demonstrations to pictures, as a user starts it."""
+    with tempfile.TemporaryDirectory() as folder:
+        recipe = Path(__file__).with_name("ls3.py")
+        arguments = [f"task={task}", "preset=smoke", f"output={folder}/run"]
+        subprocess.run([sys.executable, str(recipe), *arguments], check=True, capture_output=True)
+
+
 def run(config: DictConfig) -> dict:
     """Run the benchmark.
 
@@ -254,6 +265,9 @@ def run(config: DictConfig) -> dict:
     buffer.add(episodes, Tag.SUCCESS)
     buffer.encode(LS3Agent(flat.shape[-1], **presets[0].agent).encoder)
     bench.time("sampling 256 transitions for each of 5 members", lambda: buffer.sample(256, members=5))
+
+    if config.smoke:
+        bench.time("whole smoke run", lambda: smoke_run(config.task), once=True)
 
     for row in bench.rows:
         if "gflops" in row:

@@ -26,7 +26,9 @@ class Bench:
         self.seconds = seconds
         self.rows: list[dict[str, Any]] = []
 
-    def time(self, what: str, call: Callable[[], object], *, per: int = 1, against: str | None = None) -> float:
+    def time(
+        self, what: str, call: Callable[[], object], *, per: int = 1, against: str | None = None, once: bool = False
+    ) -> float:
         """Time ``call``.
 
         Args:
@@ -34,22 +36,25 @@ class Bench:
             call: what is timed.
             per: how many things one call does; the figure is of one.
             against: name of an earlier figure that this one is compared to.
+            once: call it a single time, for what takes long.
 
         Returns:
             The median, in seconds, of one thing.
         """
         start = time.perf_counter()
         call()
-        once = time.perf_counter() - start
-        timer = Timer("call()", globals={"call": call}, num_threads=torch.get_num_threads())
-        found = timer.blocked_autorange(min_run_time=max(self.seconds, 4 * once))  # a spread needs several runs
-        median = found.median / per
+        first = time.perf_counter() - start
+        median, spread, runs = first / per, 0.0, 1
+        if not once:
+            timer = Timer("call()", globals={"call": call}, num_threads=torch.get_num_threads())
+            found = timer.blocked_autorange(min_run_time=max(self.seconds, 4 * first))  # a spread needs several runs
+            median, spread, runs = found.median / per, found.iqr / per, len(found.times)
         earlier = {row["what"]: row["median_ms"] for row in self.rows}
         row: dict[str, Any] = {
             "what": what,
             "median_ms": 1e3 * median,
-            "iqr_ms": 1e3 * found.iqr / per,
-            "runs": len(found.times),
+            "iqr_ms": 1e3 * spread,
+            "runs": runs,
         }
         if against is not None and against in earlier:
             row |= {"against": against, "times_faster": earlier[against] / row["median_ms"]}

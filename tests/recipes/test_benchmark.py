@@ -12,11 +12,12 @@ from torchrl.data import Bounded
 import benchmark
 from ls3_torchrl import LS3Agent
 from plain import PlainVAE
+from timing import Bench
 
 
 def test_the_benchmark_writes_its_figures_and_ratios(tmp_path):
     out = tmp_path / "bench"
-    settings = ["presets=[smoke]", "batches=[1,2]", "seconds=0.01", "device=cpu", f"output={out}"]
+    settings = ["presets=[smoke]", "batches=[1,2]", "seconds=0.01", "device=cpu", "smoke=false", f"output={out}"]
     with initialize_config_dir(str(Path(benchmark.__file__).parent / "conf"), version_base="1.3"):
         benchmark.run(compose("benchmark", settings))
     written = json.loads((out / "benchmark.json").read_text())
@@ -74,3 +75,12 @@ def test_agreement_is_perfect_with_itself_and_told_apart_otherwise(monkeypatch):
     plan = LS3Agent.planner
     monkeypatch.setattr(LS3Agent, "planner", lambda self, spec, **o: plan(self, spec, **(o | {"precision": "fp32"})))
     assert benchmark.agreement(agent, options, spec, frames) == {"value_error": 0.0, "feasibility": 0.0}
+
+
+def test_what_takes_long_is_timed_once():
+    bench, calls = Bench(seconds=5.0), []
+    bench.time("long", lambda: calls.append(1), once=True)
+    assert len(calls) == 1
+    assert bench.rows[0]["runs"] == 1
+    assert bench.rows[0]["iqr_ms"] == 0.0
+    assert bench.rows[0]["median_ms"] > 0.0
