@@ -74,7 +74,7 @@ class _ConvTranspose2d(nn.ConvTranspose2d):
             image = image.contiguous(memory_format=torch.channels_last)
         else:
             image = nn.functional.conv_transpose2d(input, self.weight, None, self.stride)
-        return image + self.bias.to(image.dtype)[:, None, None]
+        return image.add_(self.bias.to(image.dtype)[:, None, None])
 
 
 class _ConvolutionalPosterior(nn.Module):
@@ -86,13 +86,13 @@ class _ConvolutionalPosterior(nn.Module):
         # Hafner et al.'s encoder with stride 3 in the second layer: 64 -> 31 -> 10 -> 4 -> 1.
         self.convolutions = nn.Sequential(
             nn.Conv2d(in_channels, 32, 4, stride=2),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(32, 64, 4, stride=3),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(64, 128, 4, stride=2),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             _Conv2d(128, _FEATURES, 4, stride=2),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Flatten(),
         )
         self.head = nn.Linear(_FEATURES, 2 * latent_dim)
@@ -223,11 +223,11 @@ class PixelDecoder(TensorDictModuleBase):
             nn.Linear(latent_dim, _FEATURES),
             nn.Unflatten(-1, (_FEATURES, 1, 1)),
             _ConvTranspose2d(_FEATURES, 128, 5, stride=2),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             _ConvTranspose2d(128, 64, 5, stride=2),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             _ConvTranspose2d(64, 32, 6, stride=2),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             _ConvTranspose2d(32, out_channels, 6, stride=2),
         )
 
