@@ -26,7 +26,8 @@ from ls3_torchrl.data import Tag, TaggedReplayBuffer, load_episodes, save_episod
 from ls3_torchrl.planners import describe_plan
 from probe import StateProbe
 from rollout import collect_demonstrations, make_env, run_episodes
-from training import Training, check_settings
+from settings import check_settings
+from training import Training
 
 
 def seeds(seed: int) -> dict[str, int]:

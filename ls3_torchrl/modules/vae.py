@@ -61,8 +61,8 @@ class _Conv2d(nn.Conv2d):
 class _ConvTranspose2d(nn.ConvTranspose2d):
     """A transposed convolution, the same result in less time.
 
-    One matrix product where the input is a single pixel. The bias is added outside: on CPUs PyTorch spends more time on
-    its gradient inside than on those of input and weights together.
+    One matrix product where the input is a single pixel. The bias is added outside: on CPUs PyTorch can spend more time
+    on its gradient inside than on those of input and weights together.
     """
 
     def forward(self, input: Tensor, output_size: list[int] | None = None) -> Tensor:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear
 
 from ls3_torchrl._checks import require_choice
 from ls3_torchrl.modules.classifiers import LatentClassifier
@@ -19,11 +17,17 @@ from ls3_torchrl.modules.ensemble import EnsembleMLP
 from ls3_torchrl.modules.value import ValueEnsemble
 from ls3_torchrl.planners.imagination import ImaginationNoise, Limits
 from ls3_torchrl.planners.latent_env import LatentEnv
+from ls3_torchrl.planners.layers import (
+    Layers,
+    Precision,
+    fastest_precision,
+    is_relu_mlp,
+    layers_of,
+    members_of,
+    run_layers,
+)
 from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction, feasible
 
-Precision = Literal["auto", "fp32", "bf16"]
-#: A network's layers: weight ``[out, in]`` and bias ``[out]``, ReLU between them.
-Layers = list[tuple[Tensor, Tensor]]
 #: Particles that are carried together: their widest layer stays in a core's cache, or fills a GPU.
 _CPU_BLOCK, _GPU_BLOCK = 4096, 262_144
 #: Particles of plans under which a part is not worth a core of its own.
@@ -34,81 +38,12 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
-def _is_relu_mlp(network: nn.Module) -> bool:
-    return isinstance(network, nn.Sequential) and all(
-        isinstance(layer, nn.Linear if i % 2 == 0 else nn.ReLU) for i, layer in enumerate(network)
-    )
-
-
-def _layers_of(network: nn.Module, dtype: torch.dtype) -> Layers:
-    assert isinstance(network, nn.Sequential)
-    return [
-        (layer.weight.detach().to(dtype).clone(), layer.bias.detach().to(dtype).clone())
-        for layer in network
-        if isinstance(layer, nn.Linear)
-    ]
-
-
-def _members_of(network: EnsembleMLP, dtype: torch.dtype) -> list[Layers]:
-    return [
-        [
-            (weight[m].detach().T.to(dtype, copy=True).contiguous(), bias[m, 0].detach().to(dtype).clone())
-            for weight, bias in zip(network.weights, network.biases, strict=True)
-        ]
-        for m in range(network.num_members)
-    ]
-
-
 def _by_member(members: Tensor) -> Groups:
     return [(m, (members == m).nonzero().flatten()) for m in members.unique().tolist()]
 
 
 def _same(one: Tensor, other: Tensor) -> bool:
     return (one.device, one.dtype) == (other.device, other.dtype) and torch.equal(one, other)
-
-
-@lru_cache(maxsize=1)
-def _has_fused_linear() -> bool:
-    """Whether PyTorch's private fused bf16 layer is there and right on this machine."""
-    x, w, b = (torch.ones(shape, dtype=torch.bfloat16) for shape in ((2, 4), (3, 4), (3,)))
-    try:
-        out = torch.ops.mkldnn._linear_pointwise(x, w, b, "relu", [], "")
-    except (AttributeError, RuntimeError, NotImplementedError):
-        return False
-    return bool((out == 5).all())
-
-
-def run_layers(x: Tensor, layers: Layers) -> Tensor:
-    """A ReLU network on rows ``[R, in]``, in the layers' own precision."""
-    last = len(layers) - 1
-    if x.dtype == torch.bfloat16 and x.device.type == "cpu" and _has_fused_linear():
-        for i, (weight, bias) in enumerate(layers):
-            x = torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu" if i < last else "none", [], "")
-        return x
-    for i, (weight, bias) in enumerate(layers):
-        x = linear(x, weight, bias)
-        if i < last:
-            x = x.relu_()
-    return x
-
-
-@lru_cache(maxsize=4)
-def fastest_precision(device_type: str) -> Literal["fp32", "bf16"]:
-    """Choose by measuring a layer of the heads' size; CUDA takes bf16, other devices what is clearly faster."""
-    if device_type != "cpu":
-        return "bf16" if device_type == "cuda" and torch.cuda.is_bf16_supported() else "fp32"
-    seconds = {}
-    for dtype in (torch.float32, torch.bfloat16):
-        x = torch.randn(2048, 256).to(dtype)
-        layers = [(torch.randn(256, 256).to(dtype), torch.randn(256).to(dtype))] * 3
-        run_layers(x, layers)
-        times = []
-        for _ in range(5):
-            start = time.perf_counter()
-            run_layers(x, layers)
-            times.append(time.perf_counter() - start)
-        seconds[dtype] = min(times)
-    return "bf16" if seconds[torch.bfloat16] < 0.67 * seconds[torch.float32] else "fp32"
 
 
 def _take_one_thread() -> None:
@@ -187,7 +122,7 @@ class FusedImagination:
         """Whether these modules can be run from a snapshot of their layers."""
         ensembles = all(isinstance(getattr(m, "network", None), EnsembleMLP) for m in (env.dynamics, value))
         heads = (env.constraint, env.goal, safe_set)
-        return ensembles and all(_is_relu_mlp(getattr(head, "network", nn.Identity())) for head in heads)
+        return ensembles and all(is_relu_mlp(getattr(head, "network", nn.Identity())) for head in heads)
 
     def _parameters(self) -> Iterable[nn.Parameter]:
         for module in (self.env.dynamics, self.env.constraint, self.env.goal, self.value, self.safe_set):
@@ -203,14 +138,14 @@ class FusedImagination:
         chosen = fastest_precision(device.type) if self.precision == "auto" else self.precision
         self._dtype = torch.bfloat16 if chosen == "bf16" else torch.float32
         network = self.env.dynamics.network
-        self._members = _members_of(network, self._dtype)
+        self._members = members_of(network, self._dtype)
         self._stacked = [
             (weight.detach().to(self._dtype).clone(), bias.detach().to(self._dtype).clone())
             for weight, bias in zip(network.weights, network.biases, strict=True)
         ]
-        self._value = _members_of(self.value.network, self._dtype)
+        self._value = members_of(self.value.network, self._dtype)
         self._heads = {
-            name: _layers_of(head.network, self._dtype)
+            name: layers_of(head.network, self._dtype)
             for name, head in (
                 ("constraint", self.env.constraint),
                 ("goal", self.env.goal),

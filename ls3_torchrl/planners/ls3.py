@@ -21,7 +21,7 @@ from ls3_torchrl._checks import (
 from ls3_torchrl.modules.classifiers import LatentClassifier
 from ls3_torchrl.modules.value import ValueEnsemble
 from ls3_torchrl.planners.cem import CEMResult, CrossEntropyMethod, Judgement
-from ls3_torchrl.planners.fused import FusedImagination, Precision
+from ls3_torchrl.planners.fused import FusedImagination
 from ls3_torchrl.planners.imagination import (
     Imagination,
     ImaginationNoise,
@@ -31,6 +31,7 @@ from ls3_torchrl.planners.imagination import (
     draw_members,
 )
 from ls3_torchrl.planners.latent_env import LatentEnv
+from ls3_torchrl.planners.layers import Precision
 from ls3_torchrl.planners.scoring import (
     ConstraintReduction,
     GoalReduction,

@@ -230,10 +230,11 @@ def test_layers_made_for_speed_equal_the_convolution_with_its_gradients(
         with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
             out = forward(x)
         weight = torch.randn_like(out) if weight is None else weight
-        results.append([out, *torch.autograd.grad((weight * out).mean(), [x, *layer.parameters()])])
+        results.append([out, *torch.autograd.grad((weight * out).sum(), [x, *layer.parameters()])])
     for ours, theirs in zip(*results, strict=True):
         assert ours.dtype == theirs.dtype
-        tolerance = 0.02 * float(theirs.detach().abs().max()) if autocast else 1e-5
+        # Of the largest value; bf16 keeps eight bits.
+        tolerance = (0.02 if autocast else 1e-4) * float(theirs.detach().abs().max())
         torch.testing.assert_close(ours, theirs, atol=tolerance, rtol=1e-4)
 
 

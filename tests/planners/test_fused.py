@@ -9,8 +9,8 @@ from torchrl.data import Bounded
 
 from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
 from ls3_torchrl.planners import FusedImagination, ImaginationNoise, LatentEnv, RolloutImagination, feasible
-from ls3_torchrl.planners.fused import fastest_precision, run_layers
 from ls3_torchrl.planners.imagination import Limits
+from ls3_torchrl.planners.layers import fastest_precision
 
 D, A, M = 4, 2, 3
 B, N, H, P = 2, 7, 3, 4
@@ -239,16 +239,6 @@ def test_auto_settles_on_what_was_measured():
     imagine(*problem())
     expected = {"fp32": torch.float32, "bf16": torch.bfloat16}[fastest_precision("cpu")]
     assert imagine._dtype == expected
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_layers_run_as_a_relu_network(dtype):
-    torch.manual_seed(0)
-    net = nn.Sequential(nn.Linear(5, 16), nn.ReLU(), nn.Linear(16, 16), nn.ReLU(), nn.Linear(16, 3))
-    layers = [(m.weight.detach().to(dtype), m.bias.detach().to(dtype)) for m in net if isinstance(m, nn.Linear)]
-    x = torch.randn(40, 5)
-    tolerance = 1e-6 if dtype == torch.float32 else 0.02
-    torch.testing.assert_close(run_layers(x.to(dtype), layers).float(), net(x).detach(), atol=tolerance, rtol=0)
 
 
 def test_unknown_precision_is_refused():

@@ -63,7 +63,7 @@ def test_the_plain_vae_has_the_layers_of_the_agents():
     assert plain.loss(torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).isfinite()
 
 
-def test_agreement_is_perfect_with_itself_and_told_apart_otherwise(monkeypatch):
+def test_bf16_agrees_closely_and_fp32_with_itself_exactly(monkeypatch):
     torch.manual_seed(0)
     agent = LS3Agent(2, latent_dim=4, value_hidden=[32], classifier_hidden=[32], dynamics_hidden=[32])
     spec = Bounded(low=-1.0, high=1.0, shape=(2,))
