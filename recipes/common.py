@@ -179,4 +179,4 @@ def print_summary(summary: dict, folder: Path) -> None:
     console.print(table)
     for name, value in summary.get("probe", {}).items():
         console.print(f"{name.replace('_', ' ')}: {value:.2f} units of the state")
-    console.print(f"{summary['minutes']:.1f} minutes; pictures, metrics and checkpoints are in [bold]{folder}[/bold]")
+    console.print(f"{summary['minutes']:.1f} minutes; everything is in [bold]{folder}[/bold]")
