@@ -132,11 +132,12 @@ def updates(bench: Bench, preset: DictConfig, action_dim: int, device: torch.dev
         data |= {"reward_to_go": -torch.rand(*shape, 1), "in_success": torch.ones(*shape, 1).bool()}
         return TensorDict(data | {"next": {"latent": torch.randn(*shape, d)}}, list(shape), device=device)
 
-    def step(loss: nn.Module, key: str, rows: TensorDict) -> Callable[[], object]:
+    def step(loss: nn.Module, key: str, rows: TensorDict, precision: str) -> Callable[[], object]:
         optimizer = torch.optim.Adam([p for p in loss.parameters() if p.requires_grad], lr=1e-4, fused=True)
 
         def take() -> None:
-            value = loss(rows)[key]
+            with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
+                value = loss(rows)[key]
             optimizer.zero_grad()
             value.backward()
             optimizer.step()
@@ -171,19 +172,16 @@ def updates(bench: Bench, preset: DictConfig, action_dim: int, device: torch.dev
         bench.time(dynamics, loop(sizes, torch.cat([z, action], -1), likelihood))
         sizes = [d, *preset.agent.value_hidden, 1]
         bench.time(values, loop(sizes, z, lambda out, m: (out - returns[:, m]).square().mean()))
-    loss = EnsembleDynamicsLoss(agent.dynamics, bootstrap=True)
-    bench.time(f"dynamics step, {name}", step(loss, "loss_dynamics", rows), against=dynamics)
-    bench.time(
-        f"value step, {name}",
-        step(OfflineValueLoss(agent.value, bootstrap=True), "loss_value", rows),
-        against=values,
-    )
-    safe_set = SafeSetLoss(agent.safe_set, gamma=0.3)
-    target, take = (
-        HardUpdate(safe_set, value_network_update_interval=99),
-        step(safe_set, "loss_safe_set", tensors(batch)),
-    )
-    bench.time(f"safe set step, {name}", lambda: (take(), target.step()))
+    for precision in ("fp32", "bf16"):
+        loss: nn.Module = EnsembleDynamicsLoss(agent.dynamics, bootstrap=True)
+        take = step(loss, "loss_dynamics", rows, precision)
+        bench.time(f"dynamics step, {name}, {precision}", take, against=dynamics)
+        take = step(OfflineValueLoss(agent.value, bootstrap=True), "loss_value", rows, precision)
+        bench.time(f"value step, {name}, {precision}", take, against=values)
+        loss = SafeSetLoss(agent.safe_set, gamma=0.3)
+        target = HardUpdate(loss, value_network_update_interval=99)
+        take = step(loss, "loss_safe_set", tensors(batch), precision)
+        bench.time(f"safe set step, {name}, {precision}", lambda: (take(), target.step()))  # noqa: B023
 
 
 def vae(bench: Bench, preset: DictConfig, frames: Tensor, device: torch.device, *, plain: bool) -> None:

@@ -19,6 +19,7 @@ def check_settings(config: DictConfig) -> None:
         "vae.schedule": (vae.schedule, ("constant", "onecycle")),
         "vae.reduction": (vae.reduction, ("mean", "sum")),
         "vae.autocast": (vae.autocast, (True, False, "auto")),
+        "optim.autocast": (config.optim.autocast, (True, False, "auto")),
     }
     for name, (value, choices) in allowed.items():
         if value not in choices:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule
 
 from common import RunFolder, console, progress
@@ -37,6 +38,11 @@ def threads(count: int | None) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def wants_bf16(setting: bool | str, device: torch.device) -> bool:
+    """What a setting ``autocast`` of true, false or auto means on a device."""
+    return fastest_precision(device.type) == "bf16" if setting == "auto" else bool(setting)
 
 
 def warmed_up(share: float, warmup: Sequence[float] | None) -> float:
@@ -71,6 +77,7 @@ class Learner:
         lr: Adam's learning rate.
         target_interval: gradient steps between copies to the target network; ``None`` without one.
         beside: a second loss that is added to the first.
+        bf16: compute the losses under bf16 autocast; weights, gradients and optimiser stay fp32.
     """
 
     def __init__(
@@ -82,13 +89,27 @@ class Learner:
         lr: float,
         target_interval: int | None = None,
         beside: Term | None = None,
+        bf16: bool = False,
     ) -> None:
-        self.name, self.loss, self.sample, self.beside = name, loss, sample, beside
+        self.name, self.loss, self.sample, self.beside, self.bf16 = name, loss, sample, beside, bf16
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True)
         self.target_interval = target_interval
         self.target: HardUpdate | None = None
         self.steps = 0
+
+    def evaluate(self) -> tuple[TensorDictBase, Tensor]:
+        """What the losses write for a new batch, and the sum that is descended."""
+        rows = self.sample()
+        second = None if self.beside is None else self.beside.sample()
+        with torch.autocast(self.parameters[0].device.type, torch.bfloat16, enabled=self.bf16):
+            losses = self.loss(rows)
+            value = losses[f"loss_{self.name}"]
+            if self.beside is not None:
+                beside = self.beside.loss(second)[f"loss_{self.name}"]
+                losses["beside"] = beside.detach()
+                value = value + self.beside.weight * beside
+        return losses, value
 
     def train(self, steps: int, what: str, run: RunFolder) -> None:
         """Take ``steps`` gradient steps."""
@@ -100,12 +121,7 @@ class Learner:
         # Networks of this size lose more by waking a second core than they gain by it.
         with threads(1), progress(steps, what) as bar:
             for i in range(steps):
-                losses = self.loss(self.sample())
-                value = losses[f"loss_{self.name}"]
-                if self.beside is not None:
-                    second = self.beside.loss(self.beside.sample())[f"loss_{self.name}"]
-                    losses["beside"] = second.detach()
-                    value = value + self.beside.weight * second
+                losses, value = self.evaluate()
                 self.optimizer.zero_grad()
                 value.backward()
                 self.optimizer.step()
@@ -141,6 +157,7 @@ class Training:
         def draw(tags: tuple, members: int | None = None) -> Callable[[], TensorDictBase]:
             return lambda: buffer.sample(batch, tags=tags, members=members if bootstrap else None)
 
+        bf16 = wants_bf16(optim.autocast, next(agent.parameters()).device)
         members, values = agent.dynamics.num_members, agent.value.num_members
         goal = ClassifierLoss(agent.goal, name="goal")
         goal.set_keys(label=("next", "success"))
@@ -155,6 +172,7 @@ class Training:
             EnsembleDynamicsLoss(agent.dynamics, bootstrap=bootstrap),
             draw(ALL_TAGS, members),
             lr=optim.dynamics_lr,
+            bf16=bf16,
         )
         failures = None
         if loss.failure_weight > 0.0:
@@ -164,6 +182,7 @@ class Training:
             OfflineValueLoss(agent.value, bootstrap=bootstrap),
             draw(VALUE_TAGS, values),
             lr=optim.lr,
+            bf16=bf16,
             beside=failures,
         )
         self.value_td = Learner(
@@ -171,6 +190,7 @@ class Training:
             TD1ValueLoss(agent.value, **td1),
             draw(VALUE_TAGS, values),
             lr=optim.lr,
+            bf16=bf16,
             target_interval=interval,
         )
         self.safe_set = Learner(
@@ -178,10 +198,13 @@ class Training:
             SafeSetLoss(agent.safe_set, gamma=loss.gamma_safe_set),
             self._safe_or_not,
             lr=optim.lr,
+            bf16=bf16,
             target_interval=interval,
         )
-        self.constraint = Learner("constraint", ClassifierLoss(agent.constraint), draw(ALL_TAGS), lr=optim.lr)
-        self.goal = Learner("goal", goal, draw(ALL_TAGS), lr=optim.lr)
+        self.constraint = Learner(
+            "constraint", ClassifierLoss(agent.constraint), draw(ALL_TAGS), lr=optim.lr, bf16=bf16
+        )
+        self.goal = Learner("goal", goal, draw(ALL_TAGS), lr=optim.lr, bf16=bf16)
         for name in loss.mean_latents:
             keys = {"latent": "loc", "next_latent": ("next", "loc")}
             getattr(self, name).loss.set_keys(**(keys if name == "dynamics" else {"latent": ("next", "loc")}))
@@ -222,7 +245,7 @@ class Training:
             else torch.optim.lr_scheduler.ConstantLR(optimizer, factor=1.0)
         )
         device = next(agent.parameters()).device
-        autocast = fastest_precision(device.type) == "bf16" if options.autocast == "auto" else options.autocast
+        autocast = wants_bf16(options.autocast, device)
         draw = self.buffer.sample_pixel_transitions if weight else self.buffer.sample_pixels
         with threads(options.threads), progress(options.steps, "VAE") as bar:
             for i in range(options.steps):

@@ -15,6 +15,9 @@ from ls3_torchrl._checks import require_at_least
 class EnsembleMLP(nn.Module):
     """M independent ReLU networks evaluated together.
 
+    Under ``torch.autocast`` the last layer stays in fp32: bf16 holds three digits, too few for a value of -60 of
+    which a unit decides.
+
     Layer i holds weights ``[M, in, out]`` and biases ``[M, 1, out]``, each member initialised as
     ``nn.Linear`` would be.
 
@@ -67,9 +70,9 @@ class EnsembleMLP(nn.Module):
         else:
             batch = inputs.shape[:-1]
             hidden = inputs.reshape(1, -1, inputs.shape[-1]).expand(self.num_members, -1, -1)
-        last = len(self.weights) - 1
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            hidden = torch.baddbmm(bias, hidden, weight)
-            if i < last:
-                hidden = hidden.relu()
+        *layers, (weight, bias) = zip(self.weights, self.biases, strict=True)
+        for hidden_weight, hidden_bias in layers:
+            hidden = torch.baddbmm(hidden_bias, hidden, hidden_weight).relu_()
+        with torch.autocast(hidden.device.type, enabled=False):
+            hidden = torch.baddbmm(bias, hidden.to(weight.dtype), weight)
         return hidden.transpose(0, 1).reshape(*batch, self.num_members, -1)

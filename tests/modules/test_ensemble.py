@@ -104,3 +104,20 @@ def test_per_member_input_needs_one_column_per_member(shape: tuple[int, ...]):
     net = EnsembleMLP(4, 2, num_members=3, hidden=(8,))
     with pytest.raises(ValueError, match="M = 3"):
         net(torch.zeros(shape), per_member=True)
+
+
+def test_under_bf16_autocast_only_the_hidden_layers_are_rounded():
+    torch.manual_seed(0)
+    net, inputs = EnsembleMLP(4, 2, num_members=3, hidden=(64, 64)), torch.randn(32, 4)
+    exact = net(inputs)
+    with torch.autocast("cpu", torch.bfloat16):
+        rough = net(inputs)
+    # By hand: bf16 products up to the last hidden layer, fp32 from there on.
+    hidden = inputs.bfloat16().expand(3, -1, -1)
+    for weight, bias in zip(net.weights[:-1], net.biases[:-1], strict=True):
+        hidden = torch.baddbmm(bias.bfloat16(), hidden, weight.bfloat16()).relu()
+    by_hand = torch.einsum("mbi,mio->bmo", hidden.float(), net.weights[-1]) + net.biases[-1].transpose(0, 1)
+    assert rough.dtype == torch.float32
+    torch.testing.assert_close(rough, by_hand)
+    torch.testing.assert_close(rough, exact, rtol=0.02, atol=0.02)
+    assert not torch.equal(rough, exact)

@@ -26,7 +26,8 @@ def test_the_benchmark_writes_its_figures_and_ratios(tmp_path):
     for figure in (
         "plan, smoke, fp32",
         "plan, smoke, auto, each of 2",
-        "dynamics step, smoke",
+        "dynamics step, smoke, bf16",
+        "value step, smoke, fp32",
         "VAE step of 256, fp32",
     ):
         row = rows[figure]

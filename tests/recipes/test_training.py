@@ -5,11 +5,12 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from tensordict import TensorDict
+from torchrl.objectives import HardUpdate
 
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.modules import ValueEnsemble
-from ls3_torchrl.objectives import OfflineValueLoss, TD1ValueLoss, VAELoss
+from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, TD1ValueLoss, VAELoss
 from training import Learner, Term, Training
 
 
@@ -236,3 +237,39 @@ def test_a_vae_that_draws_the_mean_image_is_noticed(config, capsys, error, warne
     # Black and white images in turn: their variance about the mean image is a quarter.
     Training(agent, buffer, config, Silent())._warn_of_collapse(0.25 * error)
     assert ("hardly sees" in capsys.readouterr().out) == warned
+
+
+@pytest.mark.parametrize("name", ["dynamics", "value", "safe_set"])
+def test_losses_and_gradients_under_bf16_agree_with_fp32(name):
+    torch.manual_seed(0)
+    agent = LS3Agent(action_dim=2, latent_dim=8)
+    rows = TensorDict(
+        {
+            "latent": torch.randn(256, 5, 8),
+            "action": torch.randn(256, 5, 2),
+            "reward_to_go": -60.0 - 5.0 * torch.rand(256, 5, 1),
+            "in_success": torch.rand(256, 5, 1) < 0.5,
+            "next": {"latent": torch.randn(256, 5, 8)},
+        },
+        [256, 5],
+    )
+    losses = {
+        "dynamics": (EnsembleDynamicsLoss(agent.dynamics, bootstrap=True), rows),
+        "value": (OfflineValueLoss(agent.value, bootstrap=True), rows),
+        "safe_set": (SafeSetLoss(agent.safe_set, gamma=0.3), rows[:, 0]),
+    }
+    loss, batch = losses[name]
+    if name == "safe_set":
+        HardUpdate(loss, value_network_update_interval=99)
+    found = []
+    for bf16 in (False, True):
+        learner = Learner(name, loss, lambda: batch, lr=1e-3, bf16=bf16)
+        learner.optimizer.zero_grad()
+        _, value = learner.evaluate()
+        value.backward()
+        assert all(p.grad.dtype == torch.float32 for p in learner.parameters)
+        found.append((value.detach(), torch.cat([p.grad.flatten() for p in learner.parameters])))
+    (exact, gradient), (rough, rounded) = found
+    torch.testing.assert_close(rough, exact, rtol=5e-3, atol=0.0)
+    assert not torch.equal(rounded, gradient)
+    assert (rounded - gradient).norm() < 0.05 * gradient.norm()  # bf16 rounds by 0.4 % at every product
