@@ -94,7 +94,7 @@ def agreement(agent: LS3Agent, options: dict[str, Any], spec: Bounded, frames: T
 
     Args:
         agent: trained; only then do its heads say anything.
-        options: of its planner.
+        options: of a planner.
         spec: bounds of one action.
         frames: images ``[n, C, 64, 64]`` to plan from.
 
@@ -276,12 +276,13 @@ def run(config: DictConfig) -> dict:
         trained = LS3Agent.load(config.agent, device=device)
         frames = episodes["pixels"].flatten(0, 1)
         frames = frames[torch.linspace(0, len(frames) - 1, config.states).long()]
-        options = {str(key): value for key, value in presets[0].planner.items()}
-        agreeing = agreement(trained, options, flat, frames)
-        console.print(
-            f"bf16 for fp32: value off by {agreeing['value_error']:.2%}, other feasibility for "
-            f"{agreeing['feasibility']:.2%} of candidates"
-        )
+        for preset in presets:
+            options = {str(key): value for key, value in preset.planner.items()}
+            found = agreeing[preset.preset] = agreement(trained, options, flat, frames)
+            console.print(
+                f"bf16 for fp32, planner of {preset.preset}: value off by {found['value_error']:.2%} in the median, "
+                f"other feasibility for {found['feasibility']:.2%} of candidates"
+            )
     out = {
         "agreement": agreeing,
         "hardware": hardware(device),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TypeVar
 
 import torch
@@ -82,6 +82,9 @@ class FusedImagination:
         precision: ``"fp32"``, ``"bf16"``, or ``"auto"`` for what a short measurement finds faster here.
         block: particles that are carried and judged together; by default what stays in a CPU's cache, or what fills a
             GPU.
+        compiled: fuse the work on a block with ``torch.compile`` and replay it as a CUDA graph; by default on CUDA
+            alone. Only blocks of the size that comes first are compiled, so that the rare plans for a few rows that
+            start again cost no compilation.
 
     Raises:
         ValueError: for an unknown precision.
@@ -98,6 +101,7 @@ class FusedImagination:
         safe_set_reduction: SafeSetReduction = "mean",
         precision: Precision = "auto",
         block: int | None = None,
+        compiled: bool | None = None,
     ) -> None:
         require_choice(precision, ("auto", "fp32", "bf16"), "precision")
         if not self.supports(env, value, safe_set):
@@ -110,6 +114,8 @@ class FusedImagination:
         self.safe_set_reduction = safe_set_reduction
         self.precision = precision
         self.block = block
+        self.compiled = compiled
+        self._compiled_plans: int | None = None  # plans in a block that is worth compiling
         self._seen: list[Tensor] = []
         self._steady = False
         self._members: list[Layers] = []  # the dynamics, one member after another
@@ -178,9 +184,10 @@ class FusedImagination:
             self.refresh()
         b, n, horizon, _ = actions.shape
         particles, plans = noise.members.shape[1], b * n
-        if latent.device.type != "cpu":
-            limits = None  # which plans are feasible is known there alone: asking costs more than valuing them all
         on_cpu = latent.device.type == "cpu"
+        compiled = not on_cpu if self.compiled is None else self.compiled
+        if compiled or not on_cpu:
+            limits = None  # which plans are feasible is known there alone: asking costs more than valuing them all
         workers = torch.get_num_threads() if on_cpu else 1
         block = self.block or (_CPU_BLOCK if on_cpu else _GPU_BLOCK)
         share = max(-(-plans // workers), -(-_SMALLEST_PART // particles))
@@ -189,7 +196,7 @@ class FusedImagination:
         # Rows of the batch lie one after another: a part may hold plans of several.
         row_of = torch.arange(b, device=latent.device).repeat_interleave(n)
         steps = actions.reshape(plans, horizon, -1).transpose(0, 1)
-        groups = [_by_member(members) for members in noise.members] if on_cpu else None
+        groups = [_by_member(members) for members in noise.members] if on_cpu and not compiled else None
 
         def judge(part: slice) -> PlanStatistics:
             rows = row_of[part]
@@ -203,10 +210,21 @@ class FusedImagination:
             if own is not None:
                 own = own._replace(safe_set_threshold=own.safe_set_threshold[rows])
             start = latent[first : first + 1] if alone else latent[rows]
-            return self._judge(start, steps[:, part].contiguous(), noise.members, groups, drawn, own)
+            plan = steps[:, part].contiguous()
+            if compiled and plan.shape[1] == self._compiled_plans:
+                torch.compiler.cudagraph_mark_step_begin()
+                # Copies, since the next replay writes over what this one returns.
+                return PlanStatistics(*(x.clone() for x in self._replay(start, plan, noise.members, None, drawn, None)))
+            return self._judge(start, plan, noise.members, groups, drawn, own)
 
-        found = _side_by_side(judge, parts, workers)
+        if compiled and self._compiled_plans is None:
+            self._compiled_plans = min(size, plans)
+        found = _side_by_side(judge, parts, 1 if compiled else workers)
         return PlanStatistics(*(torch.cat(pieces).unflatten(0, (b, n)) for pieces in zip(*found, strict=True)))
+
+    @cached_property
+    def _replay(self) -> Callable[..., PlanStatistics]:
+        return torch.compile(self._judge, dynamic=False, mode="reduce-overhead")
 
     @torch.no_grad()
     def _judge(

@@ -131,6 +131,30 @@ def test_memory_is_that_of_a_block_however_many_plans_there_are(precision, monke
     assert largest[1, 400, 20] == largest[4, 100, 20]
 
 
+@pytest.mark.parametrize("block", [None, 4 * 7])
+def test_what_a_gpu_compiles_is_one_graph_with_the_same_results(monkeypatch, block):
+    parts, kept = build(), torch.compile
+    exact = fused_of(parts, precision="fp32")(*problem())
+    compiled = []
+
+    def compile_whole(function, *, dynamic, mode):
+        compiled.append(mode)
+        return kept(function, dynamic=dynamic, fullgraph=True, backend="eager")
+
+    monkeypatch.setattr(torch, "compile", compile_whole)
+    imagine = fused_of(parts, precision="fp32", compiled=True, block=block)
+    for _ in range(2):
+        for one, other in zip(imagine(*problem()), exact, strict=True):
+            torch.testing.assert_close(one, other)
+    assert compiled == ["reduce-overhead"]
+    with torch.no_grad():
+        for parameter in parts["value"].parameters():
+            parameter.mul_(0.5)
+    again = fused_of(parts, precision="fp32")(*problem())
+    torch.testing.assert_close(imagine(*problem()).value, again.value)
+    assert not torch.equal(again.value, exact.value)
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
