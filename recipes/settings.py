@@ -41,6 +41,8 @@ def check_settings(config: DictConfig) -> None:
     }
     if vae.warmup is not None and not (len(vae.warmup) == 2 and 0.0 <= vae.warmup[0] < vae.warmup[1] <= 1.0):
         raise ValueError(f"vae.warmup must be null or rising shares of the steps [start, end], got {vae.warmup}.")
+    if not 0.0 <= config.optim.cooldown <= 1.0:
+        raise ValueError(f"optim.cooldown must be a share in [0, 1], got {config.optim.cooldown}.")
     loss = config.loss
     for name in ("failure_weight", "undecided_weight"):
         if loss[name] < 0.0:

@@ -53,6 +53,11 @@ def warmed_up(share: float, warmup: Sequence[float] | None) -> float:
     return min(max((share - start) / (end - start), 0.0), 1.0)
 
 
+def cooled_down(share: float, cooldown: float) -> float:
+    """What a learning rate has fallen to after a share of a phase's steps: 1, then linearly to 0 at the end."""
+    return 1.0 if share < 1.0 - cooldown else (1.0 - share) / cooldown
+
+
 class Term(NamedTuple):
     """A second loss on the same network, with batches of its own.
 
@@ -78,6 +83,8 @@ class Learner:
         target_interval: gradient steps between copies to the target network; ``None`` without one.
         beside: a second loss that is added to the first.
         bf16: compute the losses under bf16 autocast; weights, gradients and optimiser stay fp32.
+        cooldown: share of a phase's steps, at its end, over which the learning rate falls linearly to nothing: the
+            last few batches then sway what the agent acts by no more than the others.
     """
 
     def __init__(
@@ -90,8 +97,10 @@ class Learner:
         target_interval: int | None = None,
         beside: Term | None = None,
         bf16: bool = False,
+        cooldown: float = 0.0,
     ) -> None:
         self.name, self.loss, self.sample, self.beside, self.bf16 = name, loss, sample, beside, bf16
+        self.lr, self.cooldown = lr, cooldown
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True)
         self.target_interval = target_interval
@@ -121,6 +130,8 @@ class Learner:
         # Networks of this size lose more by waking a second core than they gain by it.
         with threads(1), progress(steps, what) as bar:
             for i in range(steps):
+                for group in self.optimizer.param_groups:
+                    group["lr"] = self.lr * cooled_down(i / steps, self.cooldown)
                 losses, value = self.evaluate()
                 self.optimizer.zero_grad()
                 value.backward()
@@ -157,7 +168,10 @@ class Training:
         def draw(tags: tuple, members: int | None = None) -> Callable[[], TensorDictBase]:
             return lambda: buffer.sample(batch, tags=tags, members=members if bootstrap else None)
 
-        bf16 = wants_bf16(optim.autocast, next(agent.parameters()).device)
+        how: dict[str, Any] = {
+            "bf16": wants_bf16(optim.autocast, next(agent.parameters()).device),
+            "cooldown": optim.cooldown,
+        }
         members, values = agent.dynamics.num_members, agent.value.num_members
         goal = ClassifierLoss(agent.goal, name="goal")
         goal.set_keys(label=("next", "success"))
@@ -172,7 +186,7 @@ class Training:
             EnsembleDynamicsLoss(agent.dynamics, bootstrap=bootstrap),
             draw(ALL_TAGS, members),
             lr=optim.dynamics_lr,
-            bf16=bf16,
+            **how,
         )
         failures = None
         if loss.failure_weight > 0.0:
@@ -182,7 +196,7 @@ class Training:
             OfflineValueLoss(agent.value, bootstrap=bootstrap),
             draw(VALUE_TAGS, values),
             lr=optim.lr,
-            bf16=bf16,
+            **how,
             beside=failures,
         )
         self.value_td = Learner(
@@ -190,7 +204,7 @@ class Training:
             TD1ValueLoss(agent.value, **td1),
             draw(VALUE_TAGS, values),
             lr=optim.lr,
-            bf16=bf16,
+            **how,
             target_interval=interval,
         )
         self.safe_set = Learner(
@@ -198,13 +212,13 @@ class Training:
             SafeSetLoss(agent.safe_set, gamma=loss.gamma_safe_set),
             self._safe_or_not,
             lr=optim.lr,
-            bf16=bf16,
+            **how,
             target_interval=interval,
         )
         self.constraint = Learner(
             "constraint", ClassifierLoss(agent.constraint), draw(ALL_TAGS), lr=optim.lr, bf16=bf16
         )
-        self.goal = Learner("goal", goal, draw(ALL_TAGS), lr=optim.lr, bf16=bf16)
+        self.goal = Learner("goal", goal, draw(ALL_TAGS), lr=optim.lr, **how)
         for name in loss.mean_latents:
             keys = {"latent": "loc", "next_latent": ("next", "loc")}
             getattr(self, name).loss.set_keys(**(keys if name == "dynamics" else {"latent": ("next", "loc")}))

@@ -30,6 +30,7 @@ def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_horizon(conf
         ("vae.prediction_weight", -1.0),
         ("vae.autocast", "bf16"),
         ("optim.autocast", "bf16"),
+        ("optim.cooldown", 1.5),
         ("loss.failure_weight", -0.1),
         ("loss.undecided_weight", -0.1),
         ("loss.mean_latents", ["value"]),

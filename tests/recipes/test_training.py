@@ -11,7 +11,7 @@ from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.modules import ValueEnsemble
 from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, TD1ValueLoss, VAELoss
-from training import Learner, Term, Training
+from training import Learner, Term, Training, cooled_down
 
 
 class Silent:
@@ -273,3 +273,20 @@ def test_losses_and_gradients_under_bf16_agree_with_fp32(name):
     torch.testing.assert_close(rough, exact, rtol=5e-3, atol=0.0)
     assert not torch.equal(rounded, gradient)
     assert (rounded - gradient).norm() < 0.05 * gradient.norm()  # bf16 rounds by 0.4 % at every product
+
+
+def test_the_learning_rate_falls_to_nothing_in_the_last_part_of_every_phase():
+    assert [cooled_down(share, 0.5) for share in (0.0, 0.25, 0.5, 0.75, 0.9)] == pytest.approx([1, 1, 1, 0.5, 0.2])
+    assert cooled_down(0.99, 0.0) == 1.0
+    value = ValueEnsemble(4, num_members=2, hidden=(8,))
+    rows = TensorDict({"latent": torch.randn(8, 4), "reward_to_go": torch.zeros(8, 1)}, [8])
+    rates = []
+
+    def sample():
+        rates.append(learner.optimizer.param_groups[0]["lr"])
+        return rows
+
+    learner = Learner("value", OfflineValueLoss(value), sample, lr=0.4, cooldown=0.5)
+    for _ in range(2):  # every phase starts warm again
+        learner.train(4, "Value", Silent())
+    assert rates == pytest.approx([0.4, 0.4, 0.4, 0.2] * 2)
