@@ -215,9 +215,7 @@ class Training:
             **how,
             target_interval=interval,
         )
-        self.constraint = Learner(
-            "constraint", ClassifierLoss(agent.constraint), draw(ALL_TAGS), lr=optim.lr, bf16=bf16
-        )
+        self.constraint = Learner("constraint", ClassifierLoss(agent.constraint), draw(ALL_TAGS), lr=optim.lr, **how)
         self.goal = Learner("goal", goal, draw(ALL_TAGS), lr=optim.lr, **how)
         for name in loss.mean_latents:
             keys = {"latent": "loc", "next_latent": ("next", "loc")}
