@@ -25,7 +25,7 @@ from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer, load_episodes, save_episodes
 from ls3_torchrl.planners import describe_plan
 from probe import StateProbe
-from rollout import collect_demonstrations, make_env, run_episodes
+from rollout import collect_demonstrations, make_env, run_episodes, whole_episodes
 from settings import check_settings
 from training import Training
 
@@ -83,7 +83,8 @@ def train(config: DictConfig) -> dict:
     with timed(seconds, "demonstrations"):
         if offline is None:
             offline = collect_demonstrations(config, seed["demonstrations"])
-            save_episodes(offline, run.path / "demonstrations", task=config.task.name, seed=config.seed)
+            folder = save_episodes(offline, run.path / "demonstrations", task=config.task.name, seed=config.seed)
+            offline = load_episodes(folder)  # from the disk from now on: there may be more pictures than memory
         buffer = TaggedReplayBuffer(
             config.task.buffer_capacity,
             latent_dim=config.agent.latent_dim,
@@ -95,14 +96,14 @@ def train(config: DictConfig) -> dict:
         for tag, episodes in offline.items():
             buffer.add(episodes, tag)
     demonstrations = [episode_figures(offline[Tag.SUCCESS])]
-    training = Training(agent, buffer, config, run)
+    horizon, worlds = env.base_env.horizon, config.online.episodes_per_update
+    training = Training(agent, buffer, config, run, horizon=horizon)
     with timed(seconds, "vae"):
         training.train_vae()
     with timed(seconds, "offline"):
         training.train_offline()
     agent.save(run.path / "checkpoints" / "agent_000.pt")
 
-    horizon, worlds = env.base_env.horizon, config.online.episodes_per_update
     online, tracks = [], []
     updates = config.online.updates
     bar = progress(horizon * max(updates, 1), "Planning", "step")
@@ -120,7 +121,7 @@ def train(config: DictConfig) -> dict:
         bar.reset(total=horizon)
         bar.set_description_str(f"{f'Episodes, update {update + 1}/{updates}':<24}")
         with timed(seconds, "planning"):
-            episodes = next(rounds)
+            episodes = whole_episodes(next(rounds))
         figures = episode_figures(episodes)
         online.append(figures)
         tracks.append(episodes["next", "state"].cpu())

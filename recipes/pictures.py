@@ -65,7 +65,8 @@ def draw_all(
         learning_curves(folder)
         reconstructions(folder, agent, offline)
         film(folder / "evaluation.gif", evaluation)
-        env = ls3_envs.make(config.task.name, num_worlds=1, seed=config.seed)
+        timelines(folder, agent, planner, offline, evaluation)
+        env = ls3_envs.make(config.task.name, num_worlds=1, seed=config.seed).base_env
         if env.plane() is not None:
             maps(folder, env, agent, planner, offline)
             paths(folder, env, offline, tracks, evaluation)
@@ -121,7 +122,7 @@ def reconstructions(folder: Path, agent: LS3Agent, offline: dict[Tag, TensorDict
     figure, axes = plt.subplots(2, columns, figsize=(columns, 2.2))
     for column in range(columns):
         for row, (images, name) in enumerate(((frames, "input"), (made, "VAE"))):
-            axes[row, column].imshow(images[column, :3].permute(1, 2, 0).numpy())
+            axes[row, column].imshow(images[column, -3:].permute(1, 2, 0).numpy())
             axes[row, column].set_axis_off()
             if column == 0:
                 axes[row, 0].set_title(name, loc="left")
@@ -276,6 +277,56 @@ def plans(
         axis.set(xlim=(centre[0] - 54, centre[0] + 54), ylim=(centre[1] + 45, centre[1] - 45))
         axis.set_title(f"step {t}: {verdict.feasible.float().mean():.0%} feasible")
     figure.savefig(folder / "plans.png")
+    plt.close(figure)
+
+
+@torch.no_grad()
+def timelines(
+    folder: Path,
+    agent: LS3Agent,
+    planner: LS3Planner,
+    offline: dict[Tag, TensorDictBase],
+    evaluation: TensorDictBase,
+    *,
+    frames: int = 7,
+) -> None:
+    """What the heads say along a demonstration, a violation and an episode of the agent, under its frames."""
+    shown = {"Demonstration": offline[Tag.SUCCESS][0]}
+    if Tag.CONSTRAINT in offline:
+        shown["Violating trajectory"] = offline[Tag.CONSTRAINT][0]
+    shown["The agent"] = evaluation[0]
+    figure, axes = plt.subplots(3, len(shown), figsize=(4.6 * len(shown), 4.4), height_ratios=(0.55, 1, 1))
+    for column, (title, episode) in zip(axes.T.reshape(len(shown), 3), shown.items(), strict=True):
+        pixels = episode["next", "pixels"]
+        chosen = torch.linspace(0, len(pixels) - 1, frames).long()
+        strip = torch.cat([image[-3:] for image in pixels[chosen].cpu()], -1)
+        column[0].imshow(strip.permute(1, 2, 0).numpy(), aspect="auto", extent=(0, len(pixels), 0, 1))
+        column[0].set(title=title, xticks=[], yticks=[])
+        latent = agent.encoder(TensorDict({"pixels": pixels.to(_device(agent))}, [len(pixels)]))["latent"]
+        values = agent.value(TensorDict({"latent": latent}, [len(latent)]))["state_value"].squeeze(-1).cpu()
+        time = np.arange(1, len(pixels) + 1)
+        middle, spread = values.mean(-1).numpy(), values.std(-1).numpy()
+        column[1].plot(time, middle, color=INK, lw=1.4)
+        column[1].fill_between(time, middle - spread, middle + spread, color=INK, alpha=0.15, lw=0)
+        heads = ((agent.safe_set, "safe set", SAFE), (agent.constraint, "constraint", UNSAFE))
+        for head, name, colour in (*heads, (agent.goal, "goal", "#e0a458")):
+            column[2].plot(time, head.probability(latent).flatten().cpu().numpy(), color=colour, lw=1.4, label=name)
+        for level, colour in ((planner.safe_set_threshold, SAFE), (planner.constraint_threshold, UNSAFE)):
+            column[2].axhline(level, color=colour, lw=0.7, ls=":")
+        for key, colour in (("success", "#e0a458"), ("constraint", UNSAFE)):
+            happened = episode["next", key].flatten().nonzero().flatten()
+            if len(happened):
+                for axis in column[1:]:
+                    axis.axvline(int(happened[0]) + 1, color=colour, lw=1.0, alpha=0.6)
+        column[2].set(ylim=(-0.03, 1.03), xlabel="step")
+        for axis in column[1:]:
+            axis.set_xlim(0, len(pixels))
+            axis.grid(color=PALE, alpha=0.4, lw=0.6)
+    axes.reshape(3, -1)[1, 0].set_ylabel("value V")
+    axes.reshape(3, -1)[2, 0].set_ylabel("probability")
+    axes.reshape(3, -1)[2, 0].legend(loc="center left", fontsize=7)
+    figure.tight_layout()
+    figure.savefig(folder / "timelines.png")
     plt.close(figure)
 
 

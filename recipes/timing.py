@@ -77,7 +77,7 @@ def show(rows: list[dict[str, Any]], folder: Path) -> None:
         title="Benchmark",
         caption="faster: how many times, than the plain path; of peak: of the largest product's FLOP/s",
     )
-    for column in ("", "median", "spread", "runs", "faster", "of peak"):
+    for column in ("", "median", "spread", "runs", "faster", "of peak", "per CPU-s"):
         table.add_column(column, justify="left" if not column else "right", no_wrap=not column)
     for row in rows:
         digits = max(0, 2 - math.floor(math.log10(max(row["median_ms"], 1e-9))))
@@ -88,6 +88,7 @@ def show(rows: list[dict[str, Any]], folder: Path) -> None:
             str(row["runs"]),
             f"{row['times_faster']:.1f}" if "times_faster" in row else "",
             f"{row['share_of_peak']:.0%}" if "share_of_peak" in row else "",
+            f"{row['per_cpu_second']:.0f}" if "per_cpu_second" in row else "",
         )
     console.print(table)
     console.print(f"benchmark.json is in [bold]{folder}[/bold]")

@@ -14,7 +14,7 @@ from torchrl.objectives import HardUpdate, LossModule
 
 from common import RunFolder, console, progress
 from ls3_torchrl import LS3Agent
-from ls3_torchrl.data import ALL_TAGS, VALUE_TAGS, Tag, TaggedReplayBuffer, random_resized_crop
+from ls3_torchrl.data import ALL_TAGS, VALUE_TAGS, Tag, TaggedReplayBuffer, random_perspective, random_resized_crop
 from ls3_torchrl.objectives import (
     ClassifierLoss,
     EnsembleDynamicsLoss,
@@ -158,10 +158,13 @@ class Training:
         buffer: filled with the offline data.
         config: the recipe's configuration.
         run: where metrics go.
+        horizon: steps in an episode.
     """
 
-    def __init__(self, agent: LS3Agent, buffer: TaggedReplayBuffer, config: DictConfig, run: RunFolder) -> None:
-        self.agent, self.buffer, self.config, self.run = agent, buffer, config, run
+    def __init__(
+        self, agent: LS3Agent, buffer: TaggedReplayBuffer, config: DictConfig, run: RunFolder, *, horizon: int = 100
+    ) -> None:
+        self.agent, self.buffer, self.config, self.run, self.horizon = agent, buffer, config, run, horizon
         optim, loss = config.optim, config.loss
         batch, interval, bootstrap = optim.batch_size, optim.target_interval, optim.bootstrap
 
@@ -227,7 +230,10 @@ class Training:
         rows = self.buffer.sample(
             max(optim.batch_size // 4, 1), tags=[Tag.CONSTRAINT], members=members if optim.bootstrap else None
         )
-        value = self.config.loss.failure_value
+        loss, horizon = self.config.loss, self.horizon
+        value = loss.failure_value
+        if value is None:
+            value = -(1.0 - loss.gamma**horizon) / (1.0 - loss.gamma) if loss.gamma < 1.0 else -float(horizon)
         return rows.set("reward_to_go", torch.full_like(rows["reward_to_go"], value))
 
     def _safe_or_not(self) -> TensorDictBase:
@@ -245,9 +251,8 @@ class Training:
         for half in (agent.encoder, agent.decoder):
             half.to(memory_format=torch.channels_last)
         loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta, reduction=options.reduction)
-        loss.set_keys(target="target_pixels")
+        loss.set_keys(pixels="vae_input", target="vae_target")
         predictability = LatentPredictionLoss(agent.encoder, agent.dynamics)
-        predictability.set_keys(pixels="target_pixels")
         weight = options.prediction_weight
         learnt = [*loss.parameters(), *(agent.dynamics.parameters() if weight else ())]
         optimizer = torch.optim.Adam(learnt, lr=options.lr, fused=True)
@@ -263,10 +268,10 @@ class Training:
             for i in range(options.steps):
                 warmth = warmed_up((i + 1) / options.steps, options.warmup)
                 loss.beta = options.beta * warmth
-                batch = draw(options.batch_size).to(device).rename_key_("pixels", "target_pixels")
-                target = batch["target_pixels"]
+                batch = draw(options.batch_size).to(device)
+                target = batch["vae_target"] = self._enlarge(batch["pixels"])
                 crop = options.crop_scale
-                batch["pixels"] = target if crop is None else random_resized_crop(target, scale=tuple(crop))
+                batch["vae_input"] = target if crop is None else random_resized_crop(target, scale=tuple(crop))
                 with torch.autocast(device.type, torch.bfloat16, enabled=autocast):
                     losses = loss(batch)
                     value = losses["loss_vae"]
@@ -293,6 +298,17 @@ class Training:
             agent.encoder.rescale(1.0 / spread)
             agent.decoder.rescale(1.0 / spread)
             self._encode()
+
+    def _enlarge(self, pixels: Tensor) -> Tensor:
+        """Images as if drawn from a dataset that shifts and perspectives have enlarged to ``vae.enlarge_to`` images."""
+        goal = self.config.vae.enlarge_to
+        if goal is None or goal <= len(self.buffer.pixels):
+            return pixels
+        changed = torch.rand(len(pixels)) > len(self.buffer.pixels) / goal
+        if changed.any():
+            pixels = pixels.clone()
+            pixels[changed] = random_perspective(pixels[changed])
+        return pixels
 
     def _warn_of_collapse(self, error: float) -> None:
         """Say so when the VAE draws little more than the mean of all images: nothing can be learnt from its latents."""

@@ -39,7 +39,9 @@ class VisualConstraintEnv(EnvBase):
         seed: seed of the worlds' random streams; drawn from torch's global generator when ``None``.
 
     Raises:
-        ValueError: for fewer than one world or step; by ``step`` for an action outside the box or not finite.
+        ValueError: for fewer than one world or step; by ``step`` for an action of another shape, outside the box or
+            not finite.
+        RuntimeError: by ``step`` before the first ``reset``.
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class VisualConstraintEnv(EnvBase):
         self._state = torch.zeros(num_worlds, state_dim, device=self.device)
         self._frozen = torch.zeros(num_worlds, 1, dtype=torch.bool, device=self.device)
         self._clock = torch.zeros(num_worlds, dtype=torch.long, device=self.device)
+        self._started = False
         self._generators: list[np.random.Generator] = []
         self.set_seed(int(torch.randint(2**31 - 1, ())) if seed is None else seed)
 
@@ -123,6 +126,10 @@ class VisualConstraintEnv(EnvBase):
         """Images uint8 ``[n, 3, image_size, image_size]`` of any states ``[n, state_dim]``, for pictures."""
         return self._render(state.to(self.device))
 
+    def render_rgb(self) -> Tensor:
+        """The worlds as they are now, in colour, uint8 ``[N, 3, image_size, image_size]``, whatever the agent sees."""
+        return self._render(self._state)
+
     def plane(self, points: int = 60) -> tuple[Tensor, tuple[float, float, float, float]] | None:
         """A grid of states to draw maps over, where the domain is a plane; ``None`` where it is not.
 
@@ -146,7 +153,8 @@ class VisualConstraintEnv(EnvBase):
             torch.arange(self.num_worlds) if mask is None else mask.reshape(self.num_worlds).nonzero().flatten().cpu()
         )
         for world in rows.tolist():
-            self._state[world] = self._initial_state(world, self._generators[world]).to(self.device)
+            self._state[world] = self._initial_state(world, self._generators[world]).to(self._state)
+        self._started = True
         self._clock[rows] = 0
         self._frozen[rows] = self._violates(self._state)[rows]
         return self._observe()
@@ -156,7 +164,7 @@ class VisualConstraintEnv(EnvBase):
         return TensorDict(
             {
                 "pixels": self._render(state),
-                "state": state,
+                "state": state.float(),
                 "constraint": self._violates(state),
                 "success": self._succeeds(state),
             },
@@ -166,6 +174,10 @@ class VisualConstraintEnv(EnvBase):
 
     def _check_action(self, action: Tensor) -> None:
         space = self.action_spec.space
+        if action.shape != space.low.shape:
+            raise ValueError(
+                f"An action must have shape {list(space.low.shape)}, one row for each world; got {list(action.shape)}."
+            )
         excess = torch.maximum(space.low - action, action - space.high).amax()
         if not excess <= _ACTION_TOLERANCE:  # also catches NaN
             raise ValueError(
@@ -176,6 +188,8 @@ class VisualConstraintEnv(EnvBase):
             )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if not self._started:
+            raise RuntimeError("The environment was stepped before its first reset. Call env.reset() first.")
         action = tensordict.get("action")
         self._check_action(action)
         moved = self._advance(self._state, action)

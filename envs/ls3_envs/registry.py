@@ -1,17 +1,24 @@
-"""One table of domains: how each is built and who demonstrates on it."""
+"""One table of domains: how each is built, who demonstrates on it, and how many pictures the agent sees at once."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import InitTracker, TransformedEnv
+from torchrl.envs import CatFrames, Compose, InitTracker, TransformedEnv
 
+from ls3_envs import demonstrators as by
 from ls3_envs.base import VisualConstraintEnv
-from ls3_envs.demonstrators import NavigationDemonstrator, NavigationViolator, _Scripted, collect_episodes
+from ls3_envs.cable_routing import CableRoutingEnv
 from ls3_envs.navigation import NavigationEnv
+from ls3_envs.pushing import SequentialPushingEnv
+from ls3_envs.reacher import ReacherEnv
+
+#: Episodes that are collected side by side: more would hold too many pictures at once.
+_SIDE_BY_SIDE = 100
 
 
 @dataclass(frozen=True)
@@ -19,8 +26,8 @@ class OfflineData:
     """One kind of offline data: how many episodes (the paper's number), from which policy and start."""
 
     episodes: int
-    policy: Callable[..., _Scripted]
-    env_options: dict[str, object] = field(default_factory=dict)
+    policy: Callable[..., by.Scripted]
+    env_options: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -30,18 +37,46 @@ class Domain:
     Args:
         env: the environment's class; called with ``num_worlds``, ``seed``, ``device`` and options.
         offline: the offline data by the paper's names ``success``, ``rand`` and ``constraint``.
+        frames: pictures that are stacked into one observation, where one alone does not show velocities.
     """
 
     env: Callable[..., VisualConstraintEnv]
     offline: dict[str, OfflineData]
+    frames: int = 1
 
+
+_ANYWHERE: dict[str, Any] = {"start": "random"}
 
 DOMAINS: dict[str, Domain] = {
     "navigation": Domain(
         env=NavigationEnv,
         offline={
-            "success": OfflineData(50, NavigationDemonstrator),
-            "constraint": OfflineData(50, NavigationViolator, {"start": "random"}),
+            "success": OfflineData(50, by.NavigationDemonstrator),
+            "constraint": OfflineData(50, by.NavigationViolator, _ANYWHERE),
+        },
+    ),
+    "reacher": Domain(
+        env=ReacherEnv,
+        offline={
+            "success": OfflineData(50, by.ReacherDemonstrator),
+            "constraint": OfflineData(50, by.ReacherViolator, _ANYWHERE),
+            "rand": OfflineData(100, by.ReacherWanderer, {"start": "random", "horizon": 20}),
+        },
+        frames=3,
+    ),
+    "pushing": Domain(
+        env=SequentialPushingEnv,
+        offline={
+            "success": OfflineData(500, by.PushingDemonstrator),
+            "constraint": OfflineData(300, by.PushingViolator, _ANYWHERE),
+        },
+    ),
+    "cable_routing": Domain(
+        env=CableRoutingEnv,
+        offline={
+            "success": OfflineData(420, by.CableDemonstrator),
+            "rand": OfflineData(150, by.CableWanderer),
+            "constraint": OfflineData(50, by.CableViolator),
         },
     ),
 }
@@ -58,14 +93,28 @@ def domain(name: str) -> Domain:
     return DOMAINS[name]
 
 
-def make(name: str, num_worlds: int = 1, **options: object) -> VisualConstraintEnv:
-    """The domain ``name`` with ``num_worlds`` worlds.
+def make(name: str, num_worlds: int = 1, *, frames: int | None = None, **options: Any) -> TransformedEnv:
+    """The domain ``name`` with ``num_worlds`` worlds, marks at the starts of episodes, and frames stacked.
+
+    Args:
+        name: of the domain.
+        num_worlds: N.
+        frames: pictures stacked along the channels into ``pixels``, the newest last; the domain's number when ``None``.
+        options: of the environment; see its class.
+
+    Raises:
+        ValueError: for an unknown domain or fewer than one frame.
 
     Example:
         >>> make("navigation", num_worlds=3, seed=0).batch_size
         torch.Size([3])
     """
-    return domain(name).env(num_worlds=num_worlds, **options)
+    row = domain(name)
+    frames = row.frames if frames is None else frames
+    if frames < 1:
+        raise ValueError(f"frames must be at least 1, got {frames}.")
+    stacked = [CatFrames(frames, dim=-3, in_keys=["pixels"])] if frames > 1 else []
+    return TransformedEnv(row.env(num_worlds=num_worlds, **options), Compose(*stacked, InitTracker()))
 
 
 def collect_offline(
@@ -95,5 +144,13 @@ def collect_offline(
         raise ValueError(f"Domain {name!r} has no offline data {kind!r}; it has: {', '.join(sorted(kinds))}.")
     recipe = kinds[kind]
     count = recipe.episodes if episodes is None else episodes
-    env = make(name, num_worlds=count, seed=seed, device=device, **recipe.env_options)
-    return collect_episodes(TransformedEnv(env, InitTracker()), recipe.policy(seed=seed))
+    if count < 1:
+        raise ValueError(f"episodes must be at least 1, got {count}.")
+    parts = []
+    for first in range(0, count, _SIDE_BY_SIDE):
+        part = min(_SIDE_BY_SIDE, count - first)
+        # Streams of their own; those of the first part do not depend on how many parts there are.
+        own = seed + 7_919 * first
+        env = make(name, num_worlds=part, seed=own, device=device, **recipe.env_options)
+        parts.append(by.collect_episodes(env, recipe.policy(seed=own)))
+    return torch.cat(parts) if len(parts) > 1 else parts[0]

@@ -1,6 +1,6 @@
 """The data path: tags, labels, the two-store buffer, augmentation and files."""
 
-from ls3_torchrl.data.augment import random_resized_crop
+from ls3_torchrl.data.augment import random_perspective, random_resized_crop
 from ls3_torchrl.data.buffer import TaggedReplayBuffer
 from ls3_torchrl.data.dataset import check_episodes, load_episodes, save_episodes
 from ls3_torchrl.data.labels import failure_tail, in_success, reward_to_go, undecided
@@ -17,6 +17,7 @@ __all__ = [
     "failure_tail",
     "in_success",
     "load_episodes",
+    "random_perspective",
     "random_resized_crop",
     "reward_to_go",
     "save_episodes",

@@ -17,7 +17,15 @@ from timing import Bench
 
 def test_the_benchmark_writes_its_figures_and_ratios(tmp_path):
     out = tmp_path / "bench"
-    settings = ["presets=[smoke]", "batches=[1,2]", "seconds=0.01", "device=cpu", "smoke=false", f"output={out}"]
+    settings = [
+        "presets=[smoke]",
+        "domains=[navigation]",
+        "batches=[1,2]",
+        "seconds=0.01",
+        "device=cpu",
+        "smoke=false",
+        f"output={out}",
+    ]
     with initialize_config_dir(str(Path(benchmark.__file__).parent / "conf"), version_base="1.3"):
         benchmark.run(compose("benchmark", settings))
     written = json.loads((out / "benchmark.json").read_text())
@@ -33,7 +41,7 @@ def test_the_benchmark_writes_its_figures_and_ratios(tmp_path):
         row = rows[figure]
         assert row["times_faster"] == pytest.approx(rows[row["against"]]["median_ms"] / row["median_ms"])
     assert rows["plan, smoke, fp32"]["share_of_peak"] > 0
-    assert "environment step with pixels, each of 2" in rows
+    assert rows["step with pixels, navigation, each of 2"]["per_cpu_second"] > 0
 
 
 def test_operations_of_a_plan_by_hand():

@@ -1,0 +1,175 @@
+"""Sequential pushing: a hand pushes three blocks back, one after another, but not off the table (section 1.3.3)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from ls3_envs.mujoco import MujocoEnv
+from ls3_envs.mujoco.env import PhysicsName, RendererName
+
+#: Half sides of the table top; the far edge, off which no block may fall, is at y = 0.2.
+TABLE = (0.3, 0.2)
+BLOCK_SIDE = 0.06
+#: Where the blocks stand in a row, with clear gaps between them.
+BLOCKS_X = (-0.15, 0.0, 0.15)
+BLOCKS_Y = 0.0
+#: Past this line a block is in its goal.
+GOAL_Y = 0.075
+HAND_START = (0.0, -0.14)
+HAND_RADIUS = 0.018
+MAX_STEP = 0.05
+START_STD = 0.003
+SUBSTEPS = 40
+HORIZON = 150
+
+_COLOURS = ("0.85 0.2 0.2", "0.95 0.75 0.15", "0.6 0.3 0.8")
+
+
+def _block(number: int, x: float) -> str:
+    half = BLOCK_SIDE / 2
+    return f"""
+    <body name="block{number}" pos="{x} {BLOCKS_Y} {half}">
+      <freejoint/>
+      <geom name="block{number}" type="box" size="{half} {half} {half}" mass=".1" rgba="{_COLOURS[number]} 1"/>
+    </body>"""
+
+
+def pushing_model() -> mujoco.MjModel:
+    """Table, three blocks, a cylindrical hand on two slides, and a camera above the table."""
+    width, depth = TABLE
+    goal = (TABLE[1] - GOAL_Y) / 2
+    xml = f"""
+<mujoco model="sequential pushing">
+  <option timestep=".005" integrator="implicitfast"/>
+  <visual>
+    <headlight ambient=".5 .5 .5" diffuse=".5 .5 .5" specular="0 0 0"/>
+    <quality shadowsize="0"/>
+  </visual>
+  <default>
+    <geom friction=".5"/>
+    <position kp="2000" dampratio="1"/>
+  </default>
+  <worldbody>
+    <camera name="above" pos="0 0 .72" fovy="48"/>
+    <geom name="table" type="box" pos="0 0 -.05" size="{width} {depth} .05" rgba=".55 .5 .45 1"/>
+    <geom name="goal" type="box" pos="0 {GOAL_Y + goal} .0005" size="{width} {goal} .0005" rgba=".35 .65 .4 1"
+          contype="0" conaffinity="0"/>
+    <geom name="floor" type="plane" pos="0 0 -.4" size="2 2 .1" rgba=".1 .12 .2 1"/>
+    {"".join(_block(i, x) for i, x in enumerate(BLOCKS_X))}
+    <body name="hand" pos="0 0 .035">
+      <joint name="hand_x" type="slide" axis="1 0 0" range="-.35 .35" limited="true"/>
+      <joint name="hand_y" type="slide" axis="0 1 0" range="-.25 .25" limited="true"/>
+      <geom name="hand" type="cylinder" size="{HAND_RADIUS} .03" mass=".5" rgba=".95 .95 .95 1"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <position joint="hand_x"/>
+    <position joint="hand_y"/>
+  </actuator>
+</mujoco>"""
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def hand_position(state: Tensor) -> Tensor:
+    """Where the hand is, ``[*B, 2]`` in metres, for states ``[*B, 43]``."""
+    return state[..., 21:23]
+
+
+def block_positions(state: Tensor) -> Tensor:
+    """Where the blocks' centres are, ``[*B, 3, 3]`` in metres, for states ``[*B, 43]``."""
+    return state[..., :21].unflatten(-1, (3, 7))[..., :3]
+
+
+class SequentialPushingEnv(MujocoEnv):
+    """Push every block back past the line, and none off the far edge of the table.
+
+    Actions displace the hand by up to 5 cm along x and y, carried out over 0.2 s. Success: the centres of all three
+    blocks are past 7.5 cm; violation: one of them is past the far edge, 20 cm, or off the table otherwise, and
+    everything freezes.
+
+    Deviation: blocks of 6 cm stand 15 cm apart; the authors' are 8 cm wide and 5 cm apart, so that they overlap. 40
+    substeps of 5 ms instead of 500: the end poses agree within 0.6 mm.
+
+    Args:
+        num_worlds: N.
+        start: ``"fixed"`` has the hand in front of the blocks, with noise of 3 mm; ``"random"`` anywhere in front of
+            them.
+        horizon: steps in an episode.
+        image_size: side of the image in pixels.
+        physics: ``"mujoco"``, or ``"warp"`` for a GPU.
+        renderer: ``"raytrace"``, or ``"egl"``.
+        threads: that share the worlds' physics; the machine's cores when ``None``.
+        device: of states and pictures.
+        seed: of the worlds' random streams.
+
+    Returns:
+        From ``step``: the keys of :class:`~ls3_envs.mujoco.MujocoEnv`; ``state`` holds the blocks' poses, the hand's
+        place and all velocities, ``[N, 43]``.
+
+    Raises:
+        ValueError: for an unknown ``start``, and as the base classes do.
+
+    Example:
+        >>> env = SequentialPushingEnv(num_worlds=2, seed=0)
+        >>> env.rollout(3)["next", "pixels"].shape
+        torch.Size([2, 3, 3, 64, 64])
+    """
+
+    def __init__(
+        self,
+        num_worlds: int = 1,
+        *,
+        start: Literal["fixed", "random"] = "fixed",
+        horizon: int = HORIZON,
+        image_size: int = 64,
+        physics: PhysicsName = "mujoco",
+        renderer: RendererName = "raytrace",
+        threads: int | None = None,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+    ) -> None:
+        if start not in ("fixed", "random"):
+            raise ValueError(f"start must be 'fixed' or 'random', got {start!r}.")
+        self.start = start
+        super().__init__(
+            pushing_model(),
+            "above",
+            num_worlds=num_worlds,
+            action_low=(-MAX_STEP, -MAX_STEP),
+            action_high=(MAX_STEP, MAX_STEP),
+            horizon=horizon,
+            image_size=image_size,
+            physics=physics,
+            renderer=renderer,
+            threads=threads,
+            device=device,
+            seed=seed,
+        )
+        self._rest = torch.as_tensor(np.concatenate([self.model.qpos0, np.zeros(self.model.nv)]))
+        self._ramp = (torch.arange(1, SUBSTEPS + 1, dtype=torch.float64, device=self.device) / SUBSTEPS)[:, None]
+
+    def _initial_state(self, world: int, generator: np.random.Generator) -> Tensor:
+        state = self._rest.clone()
+        place = generator.normal(HAND_START, START_STD)
+        if self.start == "random":
+            place = generator.uniform((-0.25, -0.18), (0.25, -0.06))
+        state[21:23] = torch.as_tensor(place)
+        return state
+
+    def _control(self, state: Tensor, action: Tensor) -> Tensor:
+        # The target glides to its place: a jump of 5 cm would throw the blocks.
+        return hand_position(state)[:, None] + self._ramp * action[:, None]
+
+    def _violates(self, state: Tensor) -> Tensor:
+        centres = block_positions(state)
+        x, y, z = centres.unbind(-1)
+        off = (y > TABLE[1]) | (z < 0.0) | (x.abs() > TABLE[0])
+        return off.any(-1, keepdim=True)
+
+    def _succeeds(self, state: Tensor) -> Tensor:
+        return ((block_positions(state)[..., 1] > GOAL_Y).all(-1, keepdim=True)) & ~self._violates(state)

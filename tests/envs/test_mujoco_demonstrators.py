@@ -1,0 +1,47 @@
+"""The MuJoCo domains' scripted policies keep the promises that the offline data rest on."""
+
+import pytest
+import torch
+
+from ls3_envs import collect_offline
+
+
+def shares(name: str, kind: str, episodes: int) -> tuple[float, float, torch.Tensor]:
+    data = collect_offline(name, kind, episodes=episodes, seed=0)
+    assert not data["next", "physics_error"].any()
+    success, violation = (data["next", key].any(1).float().mean().item() for key in ("success", "constraint"))
+    return success, violation, data["next", "reward"].sum((1, 2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "least", "horizon"), [("reacher", 0.85, 100), ("pushing", 0.9, 150), ("cable_routing", 0.9, 50)]
+)
+def test_demonstrations_succeed_violate_nothing_and_leave_room(name, least, horizon):
+    success, violation, returns = shares(name, "success", 20)
+    assert success >= least
+    assert violation == 0.0
+    assert -horizon < returns.mean() < -horizon / 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["reacher", "pushing", "cable_routing"])
+def test_violating_data_violate_in_most_trajectories(name):
+    assert shares(name, "constraint", 30)[1] >= 0.6
+
+
+def test_wandering_torques_stay_in_the_box_and_wander():
+    data = collect_offline("reacher", "rand", episodes=20, seed=0)
+    assert data.batch_size == (20, 20)
+    actions = data["action"]
+    assert actions.abs().max() <= 1.0
+    steps = actions.diff(dim=1)
+    inside = (actions[:, 1:].abs() < 1.0) & (actions[:, :-1].abs() < 0.3)
+    assert abs(steps[inside].std().item() - 0.2**0.5) < 0.1  # a' ~ N(a, 0.2), clamped
+
+
+def test_random_cable_data_leave_the_demonstration_at_random():
+    data, demonstrations = (collect_offline("cable_routing", kind, episodes=8, seed=0) for kind in ("rand", "success"))
+    assert data["action"].abs().max() <= 0.02 + 1e-6
+    # Uniform actions are far wider than the demonstrator's noise.
+    assert data["action"][:, -8:].std() > 2 * demonstrations["action"][:, -8:].std()

@@ -1,0 +1,62 @@
+"""Sequential pushing: what is pushed where, and when it counts."""
+
+import pytest
+import torch
+from torchrl.envs import step_mdp
+
+from ls3_envs import SequentialPushingEnv
+from ls3_envs.pushing import BLOCKS_X, GOAL_Y, TABLE, block_positions, hand_position
+
+
+def with_blocks_at(y: list[float], z: float = 0.03) -> torch.Tensor:
+    env = SequentialPushingEnv(num_worlds=1, seed=0)
+    env.reset()
+    state = env._state.clone()
+    for i, value in enumerate(y):
+        state[0, 7 * i + 1], state[0, 7 * i + 2] = value, z
+    return state
+
+
+def test_blocks_stand_in_a_row_with_clear_gaps():
+    state = SequentialPushingEnv(num_worlds=1, seed=0).reset()["state"]
+    places = block_positions(state)[0]
+    torch.testing.assert_close(places[:, 0], torch.tensor(BLOCKS_X))
+    assert (places[1:, 0] - places[:-1, 0] > 0.08).all()
+    assert hand_position(state)[0, 1] < -0.1
+
+
+@pytest.mark.parametrize(
+    ("y", "success", "constraint"),
+    [
+        ([0.08, 0.08, 0.08], True, False),
+        ([0.08, 0.08, 0.07], False, False),
+        ([0.08, 0.08, 0.21], False, True),
+        ([0.0, 0.0, 0.0], False, False),
+    ],
+)
+def test_all_blocks_past_the_line_are_success_and_one_past_the_edge_is_a_violation(y, success, constraint):
+    env = SequentialPushingEnv(num_worlds=1, seed=0)
+    state = with_blocks_at(y)
+    assert bool(env._succeeds(state)) is success
+    assert bool(env._violates(state)) is constraint
+    assert GOAL_Y == 0.075
+    assert TABLE[1] == 0.2
+
+
+def test_a_block_that_fell_is_a_violation():
+    assert bool(SequentialPushingEnv(num_worlds=1, seed=0)._violates(with_blocks_at([0.0, 0.0, 0.1], z=-0.1)))
+
+
+def test_the_hand_goes_where_it_is_told_and_takes_a_block_along():
+    env = SequentialPushingEnv(num_worlds=1, seed=0)
+    td = env.reset()
+    start = hand_position(td["state"])[0].clone()
+    td = env.step(td.set("action", torch.tensor([[0.02, 0.01]])))
+    torch.testing.assert_close(
+        hand_position(td["next", "state"])[0] - start, torch.tensor([0.02, 0.01]), atol=4e-3, rtol=0
+    )
+    for _ in range(10):
+        td = env.step(step_mdp(td).set("action", torch.tensor([[-0.002, 0.02]])))
+    moved = block_positions(td["next", "state"])[0, :, 1]
+    assert moved[1] > 0.05
+    assert moved[[0, 2]].abs().max() < 1e-3
