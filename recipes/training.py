@@ -226,10 +226,17 @@ class Training:
 
     def _failures(self) -> TensorDictBase:
         """States of the violating demonstrations, labelled with the value of failure."""
-        optim, members = self.config.optim, self.agent.value.num_members
-        rows = self.buffer.sample(
-            max(optim.batch_size // 4, 1), tags=[Tag.CONSTRAINT], members=members if optim.bootstrap else None
-        )
+        optim = self.config.optim
+        members = self.agent.value.num_members if optim.bootstrap else 1
+        count = max(optim.batch_size // 4, 1) * members
+        rows = self.buffer.sample(count, tags=[Tag.CONSTRAINT])
+        if self.config.loss.failure_rows == "violating":
+            found = rows["next", "constraint"].flatten().nonzero().flatten()
+            if len(found):
+                # Those that were found stand in for the others: the batch keeps its size.
+                rows = rows[found[torch.arange(count, device=found.device) % len(found)]]
+                rows.set("latent", rows["next", "latent"])
+        rows = rows.reshape(-1, members) if optim.bootstrap else rows
         loss, horizon = self.config.loss, self.horizon
         value = loss.failure_value
         if value is None:

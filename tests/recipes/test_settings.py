@@ -32,6 +32,7 @@ def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_horizon(conf
         ("optim.autocast", "bf16"),
         ("optim.cooldown", 1.5),
         ("loss.failure_weight", -0.1),
+        ("loss.failure_rows", "last"),
         ("loss.undecided_weight", -0.1),
         ("loss.mean_latents", ["value"]),
         ("vae.reduction", "median"),
