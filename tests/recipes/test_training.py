@@ -149,6 +149,37 @@ def test_failures_are_violating_demonstrations_at_the_value_of_failure(config):
     assert (buffer.sample(50, tags=["constraint"])["reward_to_go"] > -42.0).all()
 
 
+def test_failures_may_be_the_violating_states_alone_and_have_the_value_of_an_episode_without_success(config):
+    OmegaConf.update(config, "loss.failure_weight", 0.5)
+    OmegaConf.update(config, "loss.failure_rows", "violating")
+    agent = LS3Agent(action_dim=2, **config.agent)
+    buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
+    step = {"reward": -torch.ones(9, 1), "pixels": torch.randint(256, (9, 3, 64, 64), dtype=torch.uint8)}
+    step |= {"success": torch.zeros(9, 1, dtype=torch.bool), "constraint": torch.arange(9)[:, None] >= 7}
+    buffer.add(TensorDict({"pixels": step["pixels"], "action": torch.zeros(9, 2), "next": step}, [9]), "constraint")
+    buffer.encode(agent.encoder)
+    training = Training(agent, buffer, config, Silent(), horizon=3)
+    rows = training.value.beside.sample()
+    assert rows.batch_size == (4, agent.value.num_members)
+    assert rows["next", "constraint"].all()
+    assert torch.equal(rows["latent"], rows["next", "latent"])
+    torch.testing.assert_close(rows["reward_to_go"], torch.full_like(rows["reward_to_go"], -(1 + 0.99 + 0.99**2)))
+
+
+def test_batches_seem_drawn_from_the_enlarged_dataset(config):
+    agent = LS3Agent(action_dim=2, **config.agent)
+    buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
+    buffer.add(noisy_episode(), "success")
+    pixels = torch.randint(256, (400, 3, 64, 64), dtype=torch.uint8)
+    training = Training(agent, buffer, config, Silent())
+    assert torch.equal(training._enlarge(pixels), pixels)
+    OmegaConf.update(config, "vae.enlarge_to", 4 * len(buffer.pixels))
+    same = (training._enlarge(pixels) == pixels).flatten(1).all(1).float().mean()
+    assert abs(same - 0.25) < 0.08
+    OmegaConf.update(config, "vae.enlarge_to", len(buffer.pixels))
+    assert torch.equal(training._enlarge(pixels), pixels)
+
+
 def test_mean_latents_feed_posterior_means_to_the_models_that_are_named(config):
     OmegaConf.update(config, "loss.mean_latents", ["dynamics", "goal"])
     agent = LS3Agent(action_dim=2, **config.agent)
