@@ -105,7 +105,9 @@ class VAELoss(LossModule):
         # No clamp on the reconstruction: it would stop the gradient of every pixel that starts below zero.
         kl = kl_divergence(posterior, Normal(torch.zeros_like(posterior.loc), torch.ones_like(posterior.scale)))
         if self.reduction == "mean":
-            error, divergence = mse_loss(reconstruction, target), kl.mean()
+            # Channels last, as the images lie: PyTorch's gradient would come in another order than they.
+            error = mse_loss(reconstruction.movedim(-3, -1), target.movedim(-3, -1))
+            divergence = kl.mean()
         else:
             error = mse_loss(reconstruction, target, reduction="sum") / kl[..., 0].numel()
             divergence = kl.sum(-1).mean()

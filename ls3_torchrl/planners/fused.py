@@ -57,11 +57,12 @@ def _pool(workers: int) -> ThreadPoolExecutor:
 
 def _side_by_side(job: Callable[[Job], Result], items: Sequence[Job], workers: int) -> list[Result]:
     """Results of ``job`` on each item: whole items on each core, since layers this small gain nothing from sharing."""
-    if workers < 2 or len(items) < 2:
+    if workers < 2:
         return [job(item) for item in items]
     torch.set_num_threads(1)
     try:
-        return list(_pool(workers).map(job, items))
+        # One item alone is not handed over: it would only wait for a thread to wake.
+        return [job(items[0])] if len(items) == 1 else list(_pool(workers).map(job, items))
     finally:
         torch.set_num_threads(workers)
 

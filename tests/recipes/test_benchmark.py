@@ -15,7 +15,7 @@ from plain import PlainVAE
 from timing import Bench
 
 
-def test_the_benchmark_writes_its_figures_and_ratios(tmp_path):
+def test_the_benchmark_writes_its_figures_and_ratios(tmp_path, capsys):
     out = tmp_path / "bench"
     settings = [
         "presets=[smoke]",
@@ -29,6 +29,10 @@ def test_the_benchmark_writes_its_figures_and_ratios(tmp_path):
     with initialize_config_dir(str(Path(benchmark.__file__).parent / "conf"), version_base="1.3"):
         benchmark.run(compose("benchmark", settings))
     written = json.loads((out / "benchmark.json").read_text())
+    # Nothing of the table is cut, whatever the terminal's width.
+    table, printed = (out / "benchmark.md").read_text(), capsys.readouterr().out
+    assert all(row["what"] in table and row["what"] in printed for row in written["rows"])
+    assert "…" not in printed
     rows = {row["what"]: row for row in written["rows"]}
     assert all(row["median_ms"] > 0 and row["runs"] >= 1 for row in rows.values())
     for figure in (
