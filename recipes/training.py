@@ -167,9 +167,10 @@ class Training:
         self.agent, self.buffer, self.config, self.run, self.horizon = agent, buffer, config, run, horizon
         optim, loss = config.optim, config.loss
         batch, interval, bootstrap = optim.batch_size, optim.target_interval, optim.bootstrap
+        self._left_out = None if loss.frozen_dynamics else "frozen"
 
-        def draw(tags: tuple, members: int | None = None) -> Callable[[], TensorDictBase]:
-            return lambda: buffer.sample(batch, tags=tags, members=members if bootstrap else None)
+        def draw(tags: tuple, members: int | None = None, **options: Any) -> Callable[[], TensorDictBase]:
+            return lambda: buffer.sample(batch, tags=tags, members=members if bootstrap else None, **options)
 
         how: dict[str, Any] = {
             "bf16": wants_bf16(optim.autocast, next(agent.parameters()).device),
@@ -187,7 +188,7 @@ class Training:
         self.dynamics = Learner(
             "dynamics",
             EnsembleDynamicsLoss(agent.dynamics, bootstrap=bootstrap),
-            draw(ALL_TAGS, members),
+            draw(ALL_TAGS, members, without=self._left_out),
             lr=optim.dynamics_lr,
             **how,
         )
@@ -270,7 +271,12 @@ class Training:
         )
         device = next(agent.parameters()).device
         autocast = wants_bf16(options.autocast, device)
-        draw = self.buffer.sample_pixel_transitions if weight else self.buffer.sample_pixels
+
+        def draw(count: int) -> TensorDictBase:
+            if not weight:
+                return self.buffer.sample_pixels(count)
+            return self.buffer.sample_pixel_transitions(count, without=self._left_out)
+
         with threads(options.threads), progress(options.steps, "VAE") as bar:
             for i in range(options.steps):
                 warmth = warmed_up((i + 1) / options.steps, options.warmup)

@@ -3,7 +3,7 @@
 from ls3_torchrl.data.augment import random_perspective, random_resized_crop
 from ls3_torchrl.data.buffer import TaggedReplayBuffer
 from ls3_torchrl.data.dataset import check_episodes, load_episodes, save_episodes
-from ls3_torchrl.data.labels import failure_tail, in_success, reward_to_go, undecided
+from ls3_torchrl.data.labels import failure_tail, frozen, in_success, reward_to_go, undecided
 from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.tags import ALL_TAGS, VALUE_TAGS, Tag
 
@@ -15,6 +15,7 @@ __all__ = [
     "TaggedReplayBuffer",
     "check_episodes",
     "failure_tail",
+    "frozen",
     "in_success",
     "load_episodes",
     "random_perspective",

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torchrl.data import (
     ImmutableDatasetWriter,
     LazyMemmapStorage,
@@ -17,7 +17,7 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from ls3_torchrl._checks import require_at_least, require_finite, require_keys
-from ls3_torchrl.data.labels import failure_tail, in_success, reward_to_go, undecided
+from ls3_torchrl.data.labels import failure_tail, frozen, in_success, reward_to_go, undecided
 from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.tags import ALL_TAGS, Tag
 from ls3_torchrl.modules.vae import PixelEncoder
@@ -90,7 +90,7 @@ class TaggedReplayBuffer:
 
         self.pixels = TensorDictReplayBuffer(storage=storage(self.pixel_capacity, "pixels"), sampler=RandomSampler())
         self.latents = TensorDictReplayBuffer(storage=storage(self.capacity, "latents"), sampler=RandomSampler())
-        self._views: dict[tuple[Tag, ...], TensorDictReplayBuffer] = {}
+        self._views: dict[tuple[tuple[Tag, ...], NestedKey | None], TensorDictReplayBuffer] = {}
         self._encoder: PixelEncoder | None = None
         self._frames_written = 0
 
@@ -135,6 +135,7 @@ class TaggedReplayBuffer:
                 "action": episode["action"],
                 "tag": torch.full((steps, 1), int(tag), dtype=torch.uint8),
                 "in_success": in_success(success),
+                "frozen": frozen(episode["next", "constraint"]),
                 "undecided": undecided(success, episode["next", "constraint"]),
                 "reward_to_go": reward_to_go(reward, self.gamma, tail),
                 "frame": first + torch.arange(steps).unsqueeze(-1),
@@ -206,16 +207,21 @@ class TaggedReplayBuffer:
             )
         return TensorDict({"loc": loc, "scale": scale}, [len(frames)])
 
-    def view(self, tags: Iterable[Tag | str] = ALL_TAGS) -> TensorDictReplayBuffer:
-        """A TorchRL buffer on the same latent store that samples from the union of ``tags``."""
+    def view(self, tags: Iterable[Tag | str] = ALL_TAGS, *, without: NestedKey | None = None) -> TensorDictReplayBuffer:
+        """A TorchRL buffer on the same latent store that samples from the union of ``tags``.
+
+        Args:
+            tags: what to draw from.
+            without: label whose rows are left out, such as ``"frozen"``.
+        """
         key = tuple(sorted({Tag.parse(tag) for tag in tags}))
-        if key not in self._views:
-            self._views[key] = TensorDictReplayBuffer(
+        if (key, without) not in self._views:
+            self._views[key, without] = TensorDictReplayBuffer(
                 storage=self.latents.storage,
-                sampler=TagSampler(key),
+                sampler=TagSampler(key, without=without),
                 writer=ImmutableDatasetWriter(),
             )
-        return self._views[key]
+        return self._views[key, without]
 
     def count(self, tags: Iterable[Tag | str] = ALL_TAGS) -> int:
         """How many transitions carry one of the tags."""
@@ -223,7 +229,12 @@ class TaggedReplayBuffer:
         return int(view.sampler.rows(view.storage).numel())
 
     def sample(
-        self, batch_size: int, *, tags: Iterable[Tag | str] = ALL_TAGS, members: int | None = None
+        self,
+        batch_size: int,
+        *,
+        tags: Iterable[Tag | str] = ALL_TAGS,
+        members: int | None = None,
+        without: NestedKey | None = None,
     ) -> TensorDictBase:
         """Transitions with freshly drawn latents, uniformly from the union of the tags.
 
@@ -231,24 +242,27 @@ class TaggedReplayBuffer:
             batch_size: B.
             tags: what to draw from.
             members: M for a bootstrap: B transitions drawn independently for each of M members.
+            without: label whose rows are left out, such as ``"frozen"``.
 
         Returns:
             ``[B]``, or ``[B, M]``, with ``latent`` and ``("next", "latent")`` drawn from the posteriors.
         """
         if self._encoder is None:
             raise RuntimeError("The buffer has no latents yet: call buffer.encode(encoder) after training the VAE.")
-        rows = self.view(tags).sample(batch_size * (members or 1)).to(self.device)
+        rows = self.view(tags, without=without).sample(batch_size * (members or 1)).to(self.device)
         for group in (rows, rows.get("next")):
             loc = group.get("loc")
             group.set("latent", torch.addcmul(loc, group.get("scale"), torch.randn_like(loc)))
         return rows if members is None else rows.reshape(batch_size, members)
 
-    def sample_pixel_transitions(self, batch_size: int, *, tags: Iterable[Tag | str] = ALL_TAGS) -> TensorDictBase:
+    def sample_pixel_transitions(
+        self, batch_size: int, *, tags: Iterable[Tag | str] = ALL_TAGS, without: NestedKey | None = None
+    ) -> TensorDictBase:
         """``pixels``, ``action`` and ``("next", "pixels")`` of transitions, uniformly from the union of the tags.
 
         Unlike :meth:`sample`, it needs no encoder.
         """
-        rows = self.view(tags).sample(batch_size)
+        rows = self.view(tags, without=without).sample(batch_size)
         before, after = (self.pixels.storage[slot]["pixels"] for slot in self._slots(rows["frame"]))
         batch = TensorDict({"pixels": before, "action": rows["action"], "next": {"pixels": after}}, [batch_size])
         return batch.to(self.device)

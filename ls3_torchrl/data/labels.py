@@ -77,6 +77,23 @@ def undecided(success: Tensor, constraint: Tensor) -> Tensor:
     return (~decided).expand_as(success)
 
 
+def frozen(constraint: Tensor) -> Tensor:
+    """Whether a violation has frozen the world before the step: its action moves nothing.
+
+    Args:
+        constraint: bool ``[*B, T, 1]``, whether the step's next state violates.
+
+    Returns:
+        bool ``[*B, T, 1]``.
+
+    Example:
+        >>> frozen(torch.tensor([[False], [True], [True]])).flatten().tolist()
+        [False, False, True]
+    """
+    violated = constraint.to(torch.uint8).cummax(dim=-2).values.bool()
+    return torch.cat([torch.zeros_like(violated[..., :1, :]), violated[..., :-1, :]], dim=-2)
+
+
 def in_success(success: Tensor) -> Tensor:
     """1_S(s_t): the trajectory reaches the goal at or after this step (the label of equation (5)).
 

@@ -23,6 +23,7 @@ class TagSampler(Sampler):
     Args:
         tags: the union to draw from.
         tag_key: where the rows keep their tag, uint8 ``[1]``.
+        without: where the rows say, bool ``[1]``, whether they are left out; none is when ``None``.
 
     Raises:
         RuntimeError: when no row carries one of the tags.
@@ -39,12 +40,14 @@ class TagSampler(Sampler):
         [1, 1, 1]
     """
 
-    def __init__(self, tags: Iterable[Tag | str], *, tag_key: NestedKey = "tag") -> None:
+    def __init__(
+        self, tags: Iterable[Tag | str], *, tag_key: NestedKey = "tag", without: NestedKey | None = None
+    ) -> None:
         super().__init__()
         self.tags = tuple(sorted({Tag.parse(tag) for tag in tags}))
         if not self.tags:
             raise ValueError("A TagSampler needs at least one tag; none was given.")
-        self.tag_key = tag_key
+        self.tag_key, self.without = tag_key, without
         self._rows: Tensor | None = None
 
     def refresh(self) -> None:
@@ -59,7 +62,10 @@ class TagSampler(Sampler):
             else:
                 tag = storage[:].get(self.tag_key).flatten()
                 wanted = torch.tensor(self.tags, dtype=tag.dtype, device=tag.device)
-                self._rows = torch.isin(tag, wanted).nonzero().flatten()
+                found = torch.isin(tag, wanted)
+                if self.without is not None:
+                    found &= ~storage[:].get(self.without).flatten()
+                self._rows = found.nonzero().flatten()
         return self._rows
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:

@@ -77,6 +77,7 @@ def test_labels_and_tags_are_right_by_hand(scratch):
     assert rows["tag"].flatten().tolist() == [0, 0, 0, 2, 2]
     assert rows["in_success"].flatten().tolist() == [True, True, False, False, False]
     assert rows["undecided"].flatten().tolist() == [False, False, False, True, True]
+    assert rows["frozen"].flatten().tolist() == [False, True, True, False, False]
     assert rows["reward_to_go"].flatten().tolist() == [-1.25, -0.5, -1.0, -1.5, -1.0]
     assert rows["next", "success"].flatten().tolist() == [False, True, False, False, False]
     assert rows["next", "reward"].flatten().tolist() == [-1.0, 0.0, -1.0, -1.0, -1.0]

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ls3_torchrl.data import failure_tail, in_success, reward_to_go, undecided
+from ls3_torchrl.data import failure_tail, frozen, in_success, reward_to_go, undecided
 
 
 def test_reward_to_go_by_hand():
@@ -93,3 +93,10 @@ def test_tails_of_a_batch_are_told_apart():
 def test_an_undiscounted_tail_is_refused():
     with pytest.raises(ValueError, match=r"gamma in \[0, 1\), got 1.0"):
         failure_tail(-torch.ones(3, 1), torch.zeros(3, 1, dtype=torch.bool), 1.0)
+
+
+def test_frozen_are_the_steps_after_the_first_violation_row_by_row():
+    constraint = torch.zeros(3, 5, 1, dtype=torch.bool)
+    constraint[0, 2:] = True
+    constraint[1, 1] = True  # even where the flag does not stay
+    assert frozen(constraint).squeeze(-1).int().tolist() == [[0, 0, 0, 1, 1], [0, 0, 1, 1, 1], [0] * 5]

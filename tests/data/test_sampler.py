@@ -46,6 +46,13 @@ def test_a_tag_without_rows_says_which_and_what_to_do(tags):
         buffer.sampler.sample(buffer.storage, 2)
 
 
+def test_rows_that_say_so_are_left_out():
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8), sampler=TagSampler(["success"], without="frozen"))
+    frozen = torch.tensor([False, True, False, False]).unsqueeze(-1)
+    buffer.extend(rows([0, 0, 1, 0]).set("frozen", frozen))
+    assert buffer.sampler.rows(buffer.storage).tolist() == [0, 3]
+
+
 def test_no_tag_at_all_is_refused():
     with pytest.raises(ValueError, match="at least one tag"):
         TagSampler([])

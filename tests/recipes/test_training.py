@@ -61,7 +61,8 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(config):
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
     drawn = {}
 
-    def sample(batch_size, *, tags, members=None):
+    def sample(batch_size, *, tags, members=None, without=None):
+        assert without is None
         drawn[current] = ({tag.name.lower() for tag in tags}, members)
         raise KeyboardInterrupt
 
@@ -79,6 +80,30 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(config):
         "constraint": (everything, None),
         "goal": (everything, None),
     }
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_what_follows_a_violation_teaches_the_dynamics_as_the_setting_says(config, frozen):
+    OmegaConf.update(config, "loss.frozen_dynamics", frozen)
+    OmegaConf.update(config, "vae.prediction_weight", 1.0)
+    agent = LS3Agent(action_dim=2, **config.agent)
+    buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
+    step = {"reward": -torch.ones(9, 1), "pixels": torch.zeros(9, 3, 64, 64, dtype=torch.uint8)}
+    step |= {k: torch.zeros(9, 1, dtype=torch.bool) for k in ("constraint", "success")}
+    step["constraint"][3:] = True
+    number = torch.arange(9.0).unsqueeze(-1).expand(-1, 2)
+    buffer.add(TensorDict({"pixels": step["pixels"], "action": number, "next": step}, [9]), "constraint")
+    drawn = []
+    draw = buffer.sample_pixel_transitions
+    buffer.sample_pixel_transitions = lambda *a, **o: drawn.append(draw(*a, **o)) or drawn[-1]
+    training = Training(agent, buffer, config, Silent())
+    training.train_vae()
+    latent = {int(step) for step in training.dynamics.sample()["action"].flatten().tolist()}
+    pixels = {int(step) for batch in drawn for step in batch["action"].flatten().tolist()}
+    for steps in (latent, pixels):
+        assert (max(steps) > 3) == frozen  # the step to the violation itself is not left out
+    assert 3 in latent
+    assert len(training.constraint.sample()["next", "constraint"].unique()) == 2
 
 
 def test_undecided_episodes_count_as_the_setting_says_online_alone(config):
