@@ -45,6 +45,7 @@ class AgentArchitecture:
     initial_value: float = 0.0
     propagation: Literal["ts1", "tsinf"] = "ts1"
     control_affine: bool = False
+    background: bool = False
 
 
 class LS3Agent(nn.Module):
@@ -62,6 +63,7 @@ class LS3Agent(nn.Module):
         initial_value: where the value networks' output biases start.
         propagation: ``"ts1"`` or ``"tsinf"``.
         control_affine: the dynamics' change of the latent is affine in the action.
+        background: the decoder draws on top of a fixed image.
 
     Raises:
         ValueError: for sizes below 1 or an unknown propagation; by :meth:`load`, for a file that is no agent,
@@ -92,6 +94,7 @@ class LS3Agent(nn.Module):
         initial_value: float = 0.0,
         propagation: Literal["ts1", "tsinf"] = "ts1",
         control_affine: bool = False,
+        background: bool = False,
     ) -> None:
         super().__init__()
         for name, size in (
@@ -112,9 +115,10 @@ class LS3Agent(nn.Module):
             initial_value=initial_value,
             propagation=propagation,
             control_affine=control_affine,
+            background=background,
         )
         self.encoder = PixelEncoder(in_channels, latent_dim)
-        self.decoder = PixelDecoder(in_channels, latent_dim)
+        self.decoder = PixelDecoder(in_channels, latent_dim, background=background)
         self.dynamics = EnsembleDynamics(
             latent_dim,
             action_dim,

@@ -258,6 +258,8 @@ class Training:
         options, agent = self.config.vae, self.agent
         for half in (agent.encoder, agent.decoder):
             half.to(memory_format=torch.channels_last)
+        if agent.decoder.background is not None:
+            agent.decoder.set_background(self.buffer.mean_image())
         loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta, reduction=options.reduction)
         loss.set_keys(pixels="vae_input", target="vae_target")
         predictability = LatentPredictionLoss(agent.encoder, agent.dynamics)
@@ -288,7 +290,7 @@ class Training:
                 with torch.autocast(device.type, torch.bfloat16, enabled=autocast):
                     losses = loss(batch)
                     value = losses["loss_vae"]
-                    if weight:
+                    if weight and warmth:
                         losses["prediction"] = predictability(batch)["loss_prediction"]
                         value = value + warmth * weight * losses["prediction"]
                 optimizer.zero_grad()

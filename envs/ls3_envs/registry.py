@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import CatFrames, Compose, InitTracker, TransformedEnv
+from torch import Tensor
+from torchrl.envs import CatFrames, Compose, InitTracker, Transform, TransformedEnv, UnaryTransform
 
 from ls3_envs import demonstrators as by
 from ls3_envs.base import VisualConstraintEnv
@@ -38,11 +40,13 @@ class Domain:
         env: the environment's class; called with ``num_worlds``, ``seed``, ``device`` and options.
         offline: the offline data by the paper's names ``success``, ``rand`` and ``constraint``.
         frames: pictures that are stacked into one observation, where one alone does not show velocities.
+        frame_stride: steps between them; what moves less than a pixel a step is seen to move over several.
     """
 
     env: Callable[..., VisualConstraintEnv]
     offline: dict[str, OfflineData]
     frames: int = 1
+    frame_stride: int = 1
 
 
 _ANYWHERE: dict[str, Any] = {"start": "random"}
@@ -63,6 +67,7 @@ DOMAINS: dict[str, Domain] = {
             "rand": OfflineData(100, by.ReacherWanderer, {"start": "random", "horizon": 20}),
         },
         frames=3,
+        frame_stride=4,
     ),
     "pushing": Domain(
         env=SequentialPushingEnv,
@@ -93,17 +98,34 @@ def domain(name: str) -> Domain:
     return DOMAINS[name]
 
 
-def make(name: str, num_worlds: int = 1, *, frames: int | None = None, **options: Any) -> TransformedEnv:
+def _every(pixels: Tensor, stride: int) -> Tensor:
+    """Every ``stride``-th of the pictures stacked in ``[*B, 3 k, S, S]``, the newest among them."""
+    return pixels.unflatten(-3, (-1, 3))[..., ::stride, :, :, :].flatten(-4, -3)
+
+
+def _stack(frames: int, stride: int) -> list[Transform]:
+    if frames == 1:
+        return []
+    stack: list[Transform] = [CatFrames((frames - 1) * stride + 1, dim=-3, in_keys=["pixels"])]
+    if stride > 1:
+        stack.append(UnaryTransform(in_keys=["pixels"], out_keys=["pixels"], fn=partial(_every, stride=stride)))
+    return stack
+
+
+def make(
+    name: str, num_worlds: int = 1, *, frames: int | None = None, frame_stride: int | None = None, **options: Any
+) -> TransformedEnv:
     """The domain ``name`` with ``num_worlds`` worlds, marks at the starts of episodes, and frames stacked.
 
     Args:
         name: of the domain.
         num_worlds: N.
         frames: pictures stacked along the channels into ``pixels``, the newest last; the domain's number when ``None``.
+        frame_stride: steps between them; the domain's when ``None``. Before there are as many, the first one repeats.
         options: of the environment; see its class.
 
     Raises:
-        ValueError: for an unknown domain or fewer than one frame.
+        ValueError: for an unknown domain, fewer than one frame or a stride below one step.
 
     Example:
         >>> make("navigation", num_worlds=3, seed=0).batch_size
@@ -111,10 +133,11 @@ def make(name: str, num_worlds: int = 1, *, frames: int | None = None, **options
     """
     row = domain(name)
     frames = row.frames if frames is None else frames
-    if frames < 1:
-        raise ValueError(f"frames must be at least 1, got {frames}.")
-    stacked = [CatFrames(frames, dim=-3, in_keys=["pixels"])] if frames > 1 else []
-    return TransformedEnv(row.env(num_worlds=num_worlds, **options), Compose(*stacked, InitTracker()))
+    stride = row.frame_stride if frame_stride is None else frame_stride
+    for what, number in (("frames", frames), ("frame_stride", stride)):
+        if number < 1:
+            raise ValueError(f"{what} must be at least 1, got {number}.")
+    return TransformedEnv(row.env(num_worlds=num_worlds, **options), Compose(*_stack(frames, stride), InitTracker()))
 
 
 def collect_offline(

@@ -272,3 +272,8 @@ class TaggedReplayBuffer:
         if len(self.pixels) == 0:
             raise RuntimeError("The buffer holds no images yet: add episodes first.")
         return self.pixels.sample(batch_size).to(self.device)
+
+    def mean_image(self, *, frames: int = 4096) -> torch.Tensor:
+        """The mean of ``frames`` images drawn at random, float32 ``[C, 64, 64]`` in [0, 1]."""
+        chunks = [self.sample_pixels(512)["pixels"].float().mean(0) for _ in range(-(-frames // 512))]
+        return torch.stack(chunks).mean(0) / 255.0

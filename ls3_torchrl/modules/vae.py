@@ -244,6 +244,9 @@ class PixelDecoder(TensorDictModuleBase):
     Args:
         out_channels: C, 3 × stacked frames.
         latent_dim: D.
+        background: add what the network draws to a fixed image, :attr:`background` ``[C, 64, 64]``, black until
+            :meth:`set_background` is called. With the mean image, the network need not learn it before it sees what
+            moves. The paper has none.
         latent_key: where latents ``[*B, D]`` are read.
         reco_key: where images ``[*B, C, 64, 64]`` in about [0, 1] are written, float32.
 
@@ -263,6 +266,7 @@ class PixelDecoder(TensorDictModuleBase):
         out_channels: int = 3,
         latent_dim: int = 32,
         *,
+        background: bool = False,
         latent_key: NestedKey = "latent",
         reco_key: NestedKey = "reco_pixels",
     ) -> None:
@@ -280,6 +284,22 @@ class PixelDecoder(TensorDictModuleBase):
             nn.ReLU(inplace=True),
             _ConvTranspose2d(32, out_channels, 6, stride=2),
         )
+        self.background: Tensor | None
+        self.register_buffer("background", torch.zeros(out_channels, IMAGE_SIZE, IMAGE_SIZE) if background else None)
+
+    @torch.no_grad()
+    def set_background(self, image: Tensor) -> None:
+        """Draw on top of an image from now on.
+
+        Args:
+            image: ``[C, 64, 64]``, floats in [0, 1], such as the mean of all images.
+
+        Raises:
+            RuntimeError: for a decoder without a background.
+        """
+        if self.background is None:
+            raise RuntimeError("This decoder has no background. Build it with background=True.")
+        self.background.copy_(image)
 
     @torch.no_grad()
     def rescale(self, factor: float) -> None:
@@ -294,4 +314,6 @@ class PixelDecoder(TensorDictModuleBase):
         require_keys(tensordict, self.in_keys, "PixelDecoder")
         latent = tensordict.get(self.in_keys[0])
         images = self.network(latent.reshape(-1, latent.shape[-1])).float()
+        if self.background is not None:
+            images = images + self.background
         return tensordict.set(self.out_keys[0], images.reshape(*latent.shape[:-1], *images.shape[-3:]))

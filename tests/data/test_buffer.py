@@ -320,3 +320,12 @@ def test_encoding_reports_its_progress():
     calls = []
     buffer.encode(reading_encoder(), progress=lambda done, total: calls.append((done, total)))
     assert calls[-1] == (6, 6)
+
+
+def test_the_mean_image_is_that_of_all_frames_in_unit_floats(scratch):
+    buffer = TaggedReplayBuffer(20, latent_dim=D, scratch_dir=scratch)
+    buffer.add(Film().shoot(9), "success")  # grey values 0 to 9
+    torch.manual_seed(0)
+    mean = buffer.mean_image(frames=20_000)
+    assert mean.shape == (3, 64, 64)
+    torch.testing.assert_close(mean, torch.full_like(mean, 4.5 / 255), atol=0.1 / 255, rtol=0)

@@ -37,6 +37,25 @@ def test_every_domain_can_be_made(name: str, channels: int):
     check_env_specs(env)
 
 
+def test_frames_some_steps_apart_are_stacked_the_newest_last_and_the_first_repeats():
+    env, single = (make("navigation", num_worlds=2, frames=k, frame_stride=2, seed=0) for k in (3, 1))
+    torch.manual_seed(0)
+    stacked = env.rollout(7)
+    torch.manual_seed(0)
+    frames = single.rollout(7)["pixels"]
+    for t in range(7):
+        expected = torch.cat([frames[:, max(t - back, 0)] for back in (4, 2, 0)], -3)
+        assert torch.equal(stacked["pixels"][:, t], expected)
+    assert stacked["pixels"].dtype == torch.uint8
+
+
+def test_reacher_stacks_three_frames_four_steps_apart():
+    episode = make("reacher", num_worlds=1, seed=0).rollout(12)
+    oldest, middle, newest = episode["pixels"][0].unflatten(1, (3, 3)).unbind(1)
+    assert torch.equal(oldest[10], newest[2])
+    assert torch.equal(middle[10], newest[6])
+
+
 def test_frames_are_stacked_the_newest_last():
     env, single = (make("navigation", num_worlds=1, frames=k, seed=0) for k in (3, 1))
     stacked, alone = (e.rollout(4, set_to_zero_but_one) for e in (env, single))
@@ -52,6 +71,8 @@ def set_to_zero_but_one(tensordict):
 def test_fewer_than_one_frame_are_refused():
     with pytest.raises(ValueError, match="frames must be at least 1, got 0"):
         make("navigation", frames=0)
+    with pytest.raises(ValueError, match="frame_stride must be at least 1, got 0"):
+        make("navigation", frame_stride=0)
 
 
 def test_more_episodes_than_are_collected_at_once_begin_with_the_same_ones(monkeypatch):

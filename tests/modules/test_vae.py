@@ -256,3 +256,20 @@ def test_rescaled_latents_are_the_same_posteriors_in_another_unit_and_decode_ali
 def test_impossible_units_are_refused(half, factor):
     with pytest.raises(ValueError, match="factor must be a finite number above 0"):
         half(latent_dim=4).rescale(factor)
+
+
+def test_a_background_is_added_to_what_the_network_draws_and_is_kept_with_it():
+    torch.manual_seed(0)
+    plain, decoder = PixelDecoder(latent_dim=4), PixelDecoder(latent_dim=4, background=True)
+    decoder.network.load_state_dict(plain.network.state_dict())
+    z, image = torch.randn(3, 4), torch.rand(3, 64, 64)
+    drawn = plain(TensorDict({"latent": z}, [3]))["reco_pixels"]
+    torch.testing.assert_close(decoder(TensorDict({"latent": z}, [3]))["reco_pixels"], drawn)
+    decoder.set_background(image)
+    copy = PixelDecoder(latent_dim=4, background=True)
+    copy.load_state_dict(decoder.state_dict())
+    for one in (decoder, copy):
+        torch.testing.assert_close(one(TensorDict({"latent": z}, [3]))["reco_pixels"], drawn + image)
+    assert "background" not in plain.state_dict()
+    with pytest.raises(RuntimeError, match="background=True"):
+        plain.set_background(image)

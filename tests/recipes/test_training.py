@@ -106,6 +106,20 @@ def test_what_follows_a_violation_teaches_the_dynamics_as_the_setting_says(confi
     assert len(training.constraint.sample()["next", "constraint"].unique()) == 2
 
 
+@pytest.mark.parametrize("background", [True, False])
+def test_a_decoder_with_a_background_starts_from_the_mean_image(config, background):
+    OmegaConf.update(config, "agent.background", background)
+    agent = LS3Agent(action_dim=2, **config.agent)
+    buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
+    step = {"reward": -torch.ones(9, 1), "pixels": torch.full((9, 3, 64, 64), 51, dtype=torch.uint8)}
+    step |= {k: torch.zeros(9, 1, dtype=torch.bool) for k in ("constraint", "success")}
+    buffer.add(TensorDict({"pixels": step["pixels"], "action": torch.zeros(9, 2), "next": step}, [9]), "success")
+    run = Silent()
+    Training(agent, buffer, config, run).train_vae()
+    first = run.rows[0][2]["reconstruction"]
+    assert (first < 0.01) == background  # black is 0.2² = 0.04 away
+
+
 def test_undecided_episodes_count_as_the_setting_says_online_alone(config):
     agent = LS3Agent(action_dim=2, **config.agent)
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
