@@ -33,6 +33,8 @@ def check_settings(config: DictConfig) -> None:
         "vae.steps": vae.steps,
         "vae.batch_size": vae.batch_size,
         "vae.lr": vae.lr,
+        "vae.prediction_steps": vae.prediction_steps,
+        "loss.dynamics_steps": config.loss.dynamics_steps,
         "optim.batch_size": config.optim.batch_size,
         "optim.lr": config.optim.lr,
         "optim.dynamics_lr": config.optim.dynamics_lr,

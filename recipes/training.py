@@ -187,8 +187,13 @@ class Training:
         }
         self.dynamics = Learner(
             "dynamics",
-            EnsembleDynamicsLoss(agent.dynamics, bootstrap=bootstrap),
-            draw(ALL_TAGS, members, without=self._left_out),
+            EnsembleDynamicsLoss(agent.dynamics, bootstrap=bootstrap, steps=loss.dynamics_steps),
+            draw(
+                ALL_TAGS,
+                members,
+                without=self._left_out,
+                steps=loss.dynamics_steps if loss.dynamics_steps > 1 else None,
+            ),
             lr=optim.dynamics_lr,
             **how,
         )
@@ -277,7 +282,10 @@ class Training:
         def draw(count: int) -> TensorDictBase:
             if not weight:
                 return self.buffer.sample_pixels(count)
-            return self.buffer.sample_pixel_transitions(count, without=self._left_out)
+            steps = options.prediction_steps
+            return self.buffer.sample_pixel_transitions(
+                count, without=self._left_out, steps=steps if steps > 1 else None
+            )
 
         with threads(options.threads), progress(options.steps, "VAE") as bar:
             for i in range(options.steps):

@@ -21,6 +21,8 @@ GOAL = (0.12, 0.0)
 GOAL_RADIUS = 0.02
 OBSTACLE = (0.0, -0.03)
 OBSTACLE_RADIUS = 0.035
+#: The grasped end stays in the picture: largest |x|, least and largest y.
+GRIP_X, GRIP_Y = 0.18, (-0.2, 0.16)
 MAX_STEP = 0.02
 START_STD = 0.002
 SUBSTEPS = 20
@@ -60,8 +62,8 @@ def cable_model() -> mujoco.MjModel:
     <geom name="obstacle" {disc} pos="{OBSTACLE[0]} {OBSTACLE[1]} -.008" size="{OBSTACLE_RADIUS} .001"
           rgba=".1 .2 .9 1"/>
     <body name="gripper" pos="0 0 0">
-      <joint name="grip_x" type="slide" axis="1 0 0" range="-.25 .25" limited="true"/>
-      <joint name="grip_y" type="slide" axis="0 1 0" range="-.25 .25" limited="true"/>
+      <joint name="grip_x" type="slide" axis="1 0 0" range="-{GRIP_X} {GRIP_X}" limited="true"/>
+      <joint name="grip_y" type="slide" axis="0 1 0" range="{GRIP_Y[0]} {GRIP_Y[1]}" limited="true"/>
       <geom name="gripper" type="sphere" size=".008" mass=".1" rgba=".2 .2 .2 1" group="3" contype="0" conaffinity="0"/>
       {_chain()}
     </body>
@@ -77,7 +79,7 @@ def cable_model() -> mujoco.MjModel:
 class CableRoutingEnv(MujocoEnv):
     """Move a cable's grasped end so that the cable crosses the goal and never the obstacle.
 
-    Actions displace the grasped end by up to 2 cm along x and y. Both checks are made on the picture, by colour
+    Actions displace the grasped end by up to 2 cm along x and y; it cannot leave the picture. Both checks are made on the picture, by colour
     masking as on the paper's robot: success where red cable covers the green disc, violation, which freezes everything,
     where it covers the blue one. The gripper is not drawn, so that it hides no cable.
 
@@ -152,7 +154,8 @@ class CableRoutingEnv(MujocoEnv):
         return state
 
     def _control(self, state: Tensor, action: Tensor) -> Tensor:
-        return state[:, None, :2] + self._ramp * action[:, None]
+        x, y = (state[:, None, :2] + self._ramp * action[:, None]).unbind(-1)
+        return torch.stack([x.clamp(-GRIP_X, GRIP_X), y.clamp(*GRIP_Y)], -1)
 
     def _render(self, state: Tensor) -> Tensor:
         view = self._view(state)

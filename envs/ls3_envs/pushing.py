@@ -22,6 +22,8 @@ BLOCKS_Y = 0.0
 GOAL_Y = 0.075
 HAND_START = (0.0, -0.14)
 HAND_RADIUS = 0.018
+#: The hand stays on the table and in the picture: largest |x|, least and largest y.
+HAND_X, HAND_Y = 0.27, (-0.175, 0.185)
 MAX_STEP = 0.05
 START_STD = 0.003
 SUBSTEPS = 40
@@ -62,8 +64,8 @@ def pushing_model() -> mujoco.MjModel:
     <geom name="floor" type="plane" pos="0 0 -.4" size="2 2 .1" rgba=".1 .12 .2 1"/>
     {"".join(_block(i, x) for i, x in enumerate(BLOCKS_X))}
     <body name="hand" pos="0 0 .035">
-      <joint name="hand_x" type="slide" axis="1 0 0" range="-.35 .35" limited="true"/>
-      <joint name="hand_y" type="slide" axis="0 1 0" range="-.25 .25" limited="true"/>
+      <joint name="hand_x" type="slide" axis="1 0 0" range="-{HAND_X} {HAND_X}" limited="true"/>
+      <joint name="hand_y" type="slide" axis="0 1 0" range="{HAND_Y[0]} {HAND_Y[1]}" limited="true"/>
       <geom name="hand" type="cylinder" size="{HAND_RADIUS} .03" mass=".5" rgba=".95 .95 .95 1"/>
     </body>
   </worldbody>
@@ -88,7 +90,7 @@ def block_positions(state: Tensor) -> Tensor:
 class SequentialPushingEnv(MujocoEnv):
     """Push every block back past the line, and none off the far edge of the table.
 
-    Actions displace the hand by up to 5 cm along x and y, carried out over 0.2 s. Success: the centres of all three
+    Actions displace the hand by up to 5 cm along x and y, carried out over 0.2 s; it cannot leave the table. Success: the centres of all three
     blocks are past 7.5 cm; violation: one of them is past the far edge, 20 cm, or off the table otherwise, and
     everything freezes.
 
@@ -163,7 +165,8 @@ class SequentialPushingEnv(MujocoEnv):
 
     def _control(self, state: Tensor, action: Tensor) -> Tensor:
         # The target glides to its place: a jump of 5 cm would throw the blocks.
-        return hand_position(state)[:, None] + self._ramp * action[:, None]
+        x, y = (hand_position(state)[:, None] + self._ramp * action[:, None]).unbind(-1)
+        return torch.stack([x.clamp(-HAND_X, HAND_X), y.clamp(*HAND_Y)], -1)
 
     def _violates(self, state: Tensor) -> Tensor:
         centres = block_positions(state)

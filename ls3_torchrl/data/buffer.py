@@ -90,7 +90,7 @@ class TaggedReplayBuffer:
 
         self.pixels = TensorDictReplayBuffer(storage=storage(self.pixel_capacity, "pixels"), sampler=RandomSampler())
         self.latents = TensorDictReplayBuffer(storage=storage(self.capacity, "latents"), sampler=RandomSampler())
-        self._views: dict[tuple[tuple[Tag, ...], NestedKey | None], TensorDictReplayBuffer] = {}
+        self._views: dict[tuple[tuple[Tag, ...], NestedKey | None, int], TensorDictReplayBuffer] = {}
         self._encoder: PixelEncoder | None = None
         self._frames_written = 0
 
@@ -139,6 +139,7 @@ class TaggedReplayBuffer:
                 "undecided": undecided(success, episode["next", "constraint"]),
                 "reward_to_go": reward_to_go(reward, self.gamma, tail),
                 "frame": first + torch.arange(steps).unsqueeze(-1),
+                "steps_left": torch.arange(steps, 0, -1).unsqueeze(-1),
                 "next": {
                     "reward": reward,
                     "constraint": episode["next", "constraint"],
@@ -207,21 +208,24 @@ class TaggedReplayBuffer:
             )
         return TensorDict({"loc": loc, "scale": scale}, [len(frames)])
 
-    def view(self, tags: Iterable[Tag | str] = ALL_TAGS, *, without: NestedKey | None = None) -> TensorDictReplayBuffer:
+    def view(
+        self, tags: Iterable[Tag | str] = ALL_TAGS, *, without: NestedKey | None = None, steps: int = 1
+    ) -> TensorDictReplayBuffer:
         """A TorchRL buffer on the same latent store that samples from the union of ``tags``.
 
         Args:
             tags: what to draw from.
             without: label whose rows are left out, such as ``"frozen"``.
+            steps: only rows that so many steps of their episode begin with.
         """
-        key = tuple(sorted({Tag.parse(tag) for tag in tags}))
-        if (key, without) not in self._views:
-            self._views[key, without] = TensorDictReplayBuffer(
+        key = (tuple(sorted({Tag.parse(tag) for tag in tags})), without, steps)
+        if key not in self._views:
+            self._views[key] = TensorDictReplayBuffer(
                 storage=self.latents.storage,
-                sampler=TagSampler(key, without=without),
+                sampler=TagSampler(key[0], without=without, steps=steps),
                 writer=ImmutableDatasetWriter(),
             )
-        return self._views[key, without]
+        return self._views[key]
 
     def count(self, tags: Iterable[Tag | str] = ALL_TAGS) -> int:
         """How many transitions carry one of the tags."""
@@ -235,6 +239,7 @@ class TaggedReplayBuffer:
         tags: Iterable[Tag | str] = ALL_TAGS,
         members: int | None = None,
         without: NestedKey | None = None,
+        steps: int | None = None,
     ) -> TensorDictBase:
         """Transitions with freshly drawn latents, uniformly from the union of the tags.
 
@@ -243,28 +248,53 @@ class TaggedReplayBuffer:
             tags: what to draw from.
             members: M for a bootstrap: B transitions drawn independently for each of M members.
             without: label whose rows are left out, such as ``"frozen"``.
+            steps: K for stretches of K transitions of one episode, in their order.
 
         Returns:
-            ``[B]``, or ``[B, M]``, with ``latent`` and ``("next", "latent")`` drawn from the posteriors.
+            ``[B]``, or ``[B, M]``, or either with K behind, with ``latent`` and ``("next", "latent")`` drawn from the
+            posteriors.
         """
         if self._encoder is None:
             raise RuntimeError("The buffer has no latents yet: call buffer.encode(encoder) after training the VAE.")
-        rows = self.view(tags, without=without).sample(batch_size * (members or 1)).to(self.device)
+        count = batch_size * (members or 1)
+        rows = self._stretches(count, tags, without, steps or 1)[1].to(self.device)
         for group in (rows, rows.get("next")):
             loc = group.get("loc")
             group.set("latent", torch.addcmul(loc, group.get("scale"), torch.randn_like(loc)))
-        return rows if members is None else rows.reshape(batch_size, members)
+        shape = (batch_size, *([] if members is None else [members]), *([] if steps is None else [steps]))
+        return rows.reshape(shape)
+
+    def _stretches(
+        self, count: int, tags: Iterable[Tag | str], without: NestedKey | None, steps: int
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """The first rows ``[count]`` of stretches of one episode each, and all of their rows ``[count * steps]``."""
+        view = self.view(tags, without=without, steps=steps)
+        first = view.sample(count)
+        if steps == 1:
+            return first, first
+        row = first.get("index").reshape(count, 1) + torch.arange(steps, device=first.get("index").device)
+        return first, view.storage[row.flatten() % self.capacity]
 
     def sample_pixel_transitions(
-        self, batch_size: int, *, tags: Iterable[Tag | str] = ALL_TAGS, without: NestedKey | None = None
+        self,
+        batch_size: int,
+        *,
+        tags: Iterable[Tag | str] = ALL_TAGS,
+        without: NestedKey | None = None,
+        steps: int | None = None,
     ) -> TensorDictBase:
         """``pixels``, ``action`` and ``("next", "pixels")`` of transitions, uniformly from the union of the tags.
 
-        Unlike :meth:`sample`, it needs no encoder.
+        Unlike :meth:`sample`, it needs no encoder. With ``steps`` K, the next pixels are those of K steps later and the
+        actions ``[B, K, A]`` lead there.
         """
-        rows = self.view(tags, without=without).sample(batch_size)
-        before, after = (self.pixels.storage[slot]["pixels"] for slot in self._slots(rows["frame"]))
-        batch = TensorDict({"pixels": before, "action": rows["action"], "next": {"pixels": after}}, [batch_size])
+        first, rows = self._stretches(batch_size, tags, without, steps or 1)
+        action = rows["action"] if steps is None else rows["action"].unflatten(0, (batch_size, steps))
+        frame = first["frame"]
+        before, after = (
+            self.pixels.storage[self._slots(number)[0]]["pixels"] for number in (frame, frame + (steps or 1))
+        )
+        batch = TensorDict({"pixels": before, "action": action, "next": {"pixels": after}}, [batch_size])
         return batch.to(self.device)
 
     def sample_pixels(self, batch_size: int) -> TensorDictBase:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
+from ls3_torchrl._checks import require_at_least
 from ls3_torchrl.data.tags import Tag
 
 
@@ -24,6 +25,8 @@ class TagSampler(Sampler):
         tags: the union to draw from.
         tag_key: where the rows keep their tag, uint8 ``[1]``.
         without: where the rows say, bool ``[1]``, whether they are left out; none is when ``None``.
+        steps: rows are drawn that begin a stretch of so many steps of one episode, none of which is left out.
+        steps_left_key: where the rows keep how many steps their episode has from them on, int64 ``[1]``.
 
     Raises:
         RuntimeError: when no row carries one of the tags.
@@ -41,13 +44,20 @@ class TagSampler(Sampler):
     """
 
     def __init__(
-        self, tags: Iterable[Tag | str], *, tag_key: NestedKey = "tag", without: NestedKey | None = None
+        self,
+        tags: Iterable[Tag | str],
+        *,
+        tag_key: NestedKey = "tag",
+        without: NestedKey | None = None,
+        steps: int = 1,
+        steps_left_key: NestedKey = "steps_left",
     ) -> None:
         super().__init__()
         self.tags = tuple(sorted({Tag.parse(tag) for tag in tags}))
         if not self.tags:
             raise ValueError("A TagSampler needs at least one tag; none was given.")
         self.tag_key, self.without = tag_key, without
+        self.steps, self.steps_left_key = require_at_least(steps, 1, "steps"), steps_left_key
         self._rows: Tensor | None = None
 
     def refresh(self) -> None:
@@ -60,11 +70,16 @@ class TagSampler(Sampler):
             if len(storage) == 0:
                 self._rows = torch.zeros(0, dtype=torch.long)
             else:
-                tag = storage[:].get(self.tag_key).flatten()
+                content = storage[:]
+                tag = content.get(self.tag_key).flatten()
                 wanted = torch.tensor(self.tags, dtype=tag.dtype, device=tag.device)
                 found = torch.isin(tag, wanted)
+                if self.steps > 1:
+                    found &= content.get(self.steps_left_key).flatten() >= self.steps
                 if self.without is not None:
-                    found &= ~storage[:].get(self.without).flatten()
+                    out = content.get(self.without).flatten()
+                    for step in range(self.steps):  # an episode's rows follow one another, over the storage's end too
+                        found &= ~out.roll(-step)
                 self._rows = found.nonzero().flatten()
         return self._rows
 

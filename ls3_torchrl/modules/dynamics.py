@@ -131,6 +131,27 @@ class EnsembleDynamics(TensorDictModuleBase):
         delta, log_scale = self.read_output(output, action)
         return latent + delta, log_scale.exp()
 
+    def carry(self, latent: Tensor, actions: Tensor, *, per_member: bool = False) -> tuple[Tensor, Tensor]:
+        """Every member's mean and standard deviation over K steps, each member carrying its own mean on.
+
+        Args:
+            latent: ``[*B, D]``, or ``[*B, M, D]`` with ``per_member``.
+            actions: ``[*B, K, A]``, or ``[*B, M, K, A]`` with ``per_member``.
+            per_member: member m sees column m of the last batch dimension.
+
+        Returns:
+            Mean and standard deviation, each ``[*B, M, K, D]``.
+        """
+        if not per_member:
+            latent = latent.unsqueeze(-2).expand(*latent.shape[:-1], self.num_members, -1)
+            actions = actions.unsqueeze(-3).expand(*actions.shape[:-2], self.num_members, -1, -1)
+        means, scales = [], []
+        for action in actions.unbind(-2):
+            latent, scale = self.distribution(latent, action, per_member=True)
+            means.append(latent)
+            scales.append(scale)
+        return torch.stack(means, -2), torch.stack(scales, -2)
+
     def draw_members(self, num_rows: int, *, device: torch.device | None = None) -> Tensor:
         """Members for ``num_rows`` particles, int64 ``[num_rows]``: as even a split as can be, in random order."""
         order = torch.randperm(num_rows, device=device) % self.num_members

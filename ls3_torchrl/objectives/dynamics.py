@@ -8,7 +8,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch.distributions import Normal
 from torchrl.objectives import LossModule
 
-from ls3_torchrl._checks import require_keys
+from ls3_torchrl._checks import require_at_least, require_keys
 from ls3_torchrl.modules.dynamics import EnsembleDynamics
 from ls3_torchrl.objectives._evaluate import as_scalars, check_members
 
@@ -22,6 +22,9 @@ class EnsembleDynamicsLoss(LossModule):
         dynamics: the ensemble.
         bootstrap: the batch is ``[B, M]`` and member m learns from column m alone, as in Chua et al.;
             otherwise it is ``[B]`` and every member sees all of it.
+        steps: K, the paper's is 1. With more, the batch has K transitions of one episode behind, ``[B, K]`` or
+            ``[B, M, K]``, and every member's mean is carried on over them: what one step hardly shows, such as the
+            effect of a torque, shows over several.
 
     Returns:
         Scalars ``loss_dynamics`` and, detached, ``prediction_error`` (mean squared error of the means).
@@ -59,8 +62,9 @@ class EnsembleDynamicsLoss(LossModule):
 
     dynamics: EnsembleDynamics
 
-    def __init__(self, dynamics: EnsembleDynamics, *, bootstrap: bool = False) -> None:
+    def __init__(self, dynamics: EnsembleDynamics, *, bootstrap: bool = False, steps: int = 1) -> None:
         super().__init__()
+        self.steps = require_at_least(steps, 1, "steps")
         self.out_keys = ["loss_dynamics", "prediction_error"]
         self.dynamics = dynamics
         self.bootstrap = bootstrap
@@ -75,16 +79,24 @@ class EnsembleDynamicsLoss(LossModule):
         pass
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The loss on transitions ``[B]``, or ``[B, M]`` with ``bootstrap``."""
+        """The loss on transitions ``[B]``, or ``[B, M]`` with ``bootstrap``, or either with ``steps`` behind."""
         keys = self.tensor_keys
         require_keys(tensordict, self.in_keys, "EnsembleDynamicsLoss")
-        latent, action = tensordict.get(keys.latent), tensordict.get(keys.action)
-        target = tensordict.get(keys.next_latent)
+        latent, action, target = (tensordict.get(key) for key in (keys.latent, keys.action, keys.next_latent))
+        if self.steps == 1:
+            action, target = action.unsqueeze(-2), target.unsqueeze(-2)
+        elif latent.ndim < 3 or latent.shape[-2] != self.steps:
+            raise ValueError(
+                f"EnsembleDynamicsLoss(steps={self.steps}) needs stretches, latents of shape [B, {self.steps}, D] with "
+                f"members before them if bootstrap, got {list(latent.shape)}. Sample with steps={self.steps}."
+            )
+        else:
+            latent = latent[..., 0, :]
         if self.bootstrap:
             check_members(latent, self.dynamics.num_members, "EnsembleDynamicsLoss")
         else:
-            target = target.unsqueeze(-2)
-        loc, scale = self.dynamics.distribution(latent, action, per_member=self.bootstrap)
+            target = target.unsqueeze(-3)
+        loc, scale = self.dynamics.carry(latent, action, per_member=self.bootstrap)
         target = target.expand_as(loc)
         return as_scalars(
             loss_dynamics=-Normal(loc, scale).log_prob(target).mean(),

@@ -21,6 +21,9 @@ class LatentPredictionLoss(LossModule):
     latents that tell images apart, and folds the few things that move into many dimensions; what the dynamics learn at
     one place then holds nowhere else. Not part of the paper, which trains the VAE by itself.
 
+    What a single image hardly shows, such as speed, shows several steps later: with K actions between the images, the
+    means of the dynamics are carried on over them, each member its own.
+
     The error shrinks with the latents' scale, which equation (1)'s KL term only partly holds up:
     :meth:`~ls3_torchrl.modules.PixelEncoder.rescale` gives them a unit scale again.
 
@@ -53,8 +56,8 @@ class LatentPredictionLoss(LossModule):
 
         Attributes:
             pixels (NestedKey): images of s_t.
-            action (NestedKey): a_t.
-            next_pixels (NestedKey): images of s_{t+1}.
+            action (NestedKey): a_t, or a_t to a_{t+K-1}.
+            next_pixels (NestedKey): images of s_{t+1}, or s_{t+K}.
         """
 
         pixels: NestedKey = "pixels"
@@ -82,12 +85,15 @@ class LatentPredictionLoss(LossModule):
         pass
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The loss on transitions ``[B]`` with images ``[B, C, 64, 64]``."""
+        """The loss on images ``[B, C, 64, 64]`` and the action, or the K actions ``[B, K, A]``, between them."""
         keys = self.tensor_keys
         require_keys(tensordict, self.in_keys, "LatentPredictionLoss")
         pixels, next_pixels = tensordict.get(keys.pixels), tensordict.get(keys.next_pixels)
         both = tensordict.empty(batch_size=[2 * pixels.shape[0]])
         both.set(self.encoder.pixels_key, torch.cat([pixels, next_pixels]))
         latent, next_latent = self.encoder[0](both).get(self.encoder.loc_key).chunk(2)
-        predicted, _ = self.dynamics.distribution(latent, tensordict.get(keys.action))
+        actions = tensordict.get(keys.action)
+        if actions.ndim == latent.ndim:
+            actions = actions.unsqueeze(-2)
+        predicted = self.dynamics.carry(latent, actions)[0][..., -1, :]
         return as_scalars(loss_prediction=(predicted - next_latent.unsqueeze(-2)).square().mean())

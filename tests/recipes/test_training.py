@@ -61,8 +61,9 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(config):
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
     drawn = {}
 
-    def sample(batch_size, *, tags, members=None, without=None):
+    def sample(batch_size, *, tags, members=None, without=None, steps=None):
         assert without is None
+        assert steps is None
         drawn[current] = ({tag.name.lower() for tag in tags}, members)
         raise KeyboardInterrupt
 
