@@ -79,9 +79,9 @@ def cable_model() -> mujoco.MjModel:
 class CableRoutingEnv(MujocoEnv):
     """Move a cable's grasped end so that the cable crosses the goal and never the obstacle.
 
-    Actions displace the grasped end by up to 2 cm along x and y; it cannot leave the picture. Both checks are made on the picture, by colour
-    masking as on the paper's robot: success where red cable covers the green disc, violation, which freezes everything,
-    where it covers the blue one. The gripper is not drawn, so that it hides no cable.
+    Actions displace the grasped end by up to 2 cm along x and y; it cannot leave the picture. Both checks are made on
+    the picture, by colour masking as on the paper's robot: success where red cable covers the green disc, violation,
+    which freezes everything, where it covers the blue one. The gripper is not drawn, so that it hides no cable.
 
     The paper's task is physical; this one is simulated: a chain of 16 capsules on hinges, lying on a table that drags.
 

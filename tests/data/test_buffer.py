@@ -251,6 +251,30 @@ def test_pixel_transitions_join_both_images_to_their_action_after_the_ring_wrapp
     assert set(buffer.sample_pixel_transitions(200, tags=["online"])["action"][:, 0].tolist()) == {10, 11, 12, 13}
 
 
+def test_stretches_follow_one_episode_over_the_rings_end(scratch):
+    torch.manual_seed(0)
+    film = Film()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, scratch_dir=scratch)
+    for tag in ("success", "constraint", "online"):
+        buffer.add(film.shoot(4), tag)
+    # Left of frames 0-3, 5-8, 10-13: transitions 2, 3, 5-8, 10-13, of which the last lie at the ring's start.
+    pixels = buffer.sample_pixel_transitions(200, steps=3)
+    number = pixels["action"][..., 0].int()
+    assert set(number[:, 0].tolist()) == {5, 6, 10, 11}
+    assert torch.equal(number, number[:, :1] + torch.arange(3))
+    assert torch.equal(pixels["pixels"][:, 0, 0, 0].int(), number[:, 0])
+    assert torch.equal(pixels["next", "pixels"][:, 0, 0, 0].int(), number[:, -1] + 1)
+    buffer.encode(reading_encoder())
+    rows = buffer.sample(100, members=2, steps=2, without="frozen")
+    assert rows.shape == (100, 2, 2)
+    number = rows["action"][..., 0]
+    # Frames 3, 6, 9 and 12 lead to violations, after which an episode is frozen.
+    assert set(number[..., 0].int().flatten().tolist()) == {5, 10, 11}
+    assert torch.equal(number[..., 1], number[..., 0] + 1)
+    torch.testing.assert_close(rows["loc"][..., 0], number, atol=1e-2, rtol=0)
+    torch.testing.assert_close(rows["next", "loc"][..., 0], number + 1, atol=1e-2, rtol=0)
+
+
 def test_pixel_transitions_whose_images_are_gone_are_refused():
     film = Film()
     buffer = TaggedReplayBuffer(10, latent_dim=D, pixel_capacity=10)

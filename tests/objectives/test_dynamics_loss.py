@@ -117,6 +117,30 @@ def test_misspelt_and_missing_keys():
         loss(batch)
 
 
+@pytest.mark.parametrize("bootstrap", [False, True])
+def test_over_several_steps_every_member_carries_its_own_mean_on(bootstrap):
+    # Two stretches of three steps; with bootstrap, a batch of one row with a stretch for each of two members.
+    z, z_next = [[0.0, 9.0, 9.0], [2.0, 9.0, 9.0]], [[0.4, 2.0, 1.5], [1.0, 0.0, 2.0]]
+    batch = transitions(z, z_next)
+    pairs = [(b, m) for b in range(2) for m in range(2) if not bootstrap or b == m]
+    if bootstrap:
+        batch = batch.unsqueeze(0)
+    out = EnsembleDynamicsLoss(constant_dynamics(), bootstrap=bootstrap, steps=3)(batch)
+    ends = [(z_next[b][k], z[b][0] + (k + 1) * DELTA[m], SCALE[m]) for b, m in pairs for k in range(3)]
+    nll = -sum(log_density(*end) for end in ends) / len(ends)
+    error = sum((mean - x) ** 2 for x, mean, _ in ends) / len(ends)
+    assert out["loss_dynamics"].item() == pytest.approx(nll, rel=1e-5)
+    assert out["prediction_error"].item() == pytest.approx(error, rel=1e-5)
+
+
+def test_single_transitions_are_no_stretches():
+    loss = EnsembleDynamicsLoss(constant_dynamics(), steps=3)
+    with pytest.raises(ValueError, match=r"steps=3\) needs stretches.*\[B, 3, D\].*got \[2, 1\]"):
+        loss(transitions([0.0, 1.0], [1.0, 2.0]))
+    with pytest.raises(ValueError, match="steps must be at least 1, got 0"):
+        EnsembleDynamicsLoss(constant_dynamics(), steps=0)
+
+
 def test_dynamics_overfit_eight_transitions(minimise):
     batch = TensorDict(
         {"latent": torch.randn(8, 4), "action": torch.randn(8, 2), "next": {"latent": torch.randn(8, 4)}}, [8]

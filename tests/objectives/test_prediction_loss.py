@@ -45,6 +45,15 @@ def test_the_error_is_that_of_every_members_mean():
     assert batch.keys() == {"pixels", "action", "next"}
 
 
+def test_over_several_actions_every_member_carries_its_own_mean_on():
+    loss = LatentPredictionLoss(grey_reader(), movers())
+    actions = torch.tensor([[[0.1], [0.1]], [[-0.2], [0.1]]])
+    batch = TensorDict({"pixels": images(0.2, 0.5), "action": actions, "next": {"pixels": images(0.4, 0.2)}}, [2])
+    # Imagined: 0.4 and 0.6 for the first row, 0.4 and 0.3 for the second.
+    by_hand = (0.0**2 + 0.2**2 + 0.2**2 + 0.1**2) / 4
+    assert loss(batch)["loss_prediction"].item() == pytest.approx(by_hand, rel=1e-4)
+
+
 def test_encoder_and_dynamics_learn_through_both_images():
     encoder, dynamics = PixelEncoder(latent_dim=3), EnsembleDynamics(3, 2, num_members=2, hidden=(8,))
     loss = LatentPredictionLoss(encoder, dynamics)
