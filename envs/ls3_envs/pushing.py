@@ -91,7 +91,7 @@ class SequentialPushingEnv(MujocoEnv):
     """Push every block back past the line, and none off the far edge of the table.
 
     Actions displace the hand by up to 5 cm along x and y, carried out over 0.2 s; it cannot leave the table. Success:
-    the centres of all three blocks are past 7.5 cm; violation: one of them is past the far edge, 20 cm, or off the table
+    all three blocks' centres are past 7.5 cm. Violation: one of them is past the far edge, 20 cm, or off the table
     otherwise, and everything freezes.
 
     Deviation: blocks of 6 cm stand 15 cm apart; the authors' are 8 cm wide and 5 cm apart, so that they overlap. 40
