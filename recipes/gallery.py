@@ -56,7 +56,7 @@ def gallery(path: Path) -> Path:
                         axis.add_patch(frame)
                 title = {"success": "a demonstration", "constraint": "a violation"}[kind]
                 row[0].set_title(f"{name.replace('_', ' ')}: {title}", loc="left")
-        figure.subplots_adjust(wspace=0.06, hspace=0.32)
+        figure.subplots_adjust(wspace=0.06, hspace=0.45)
         figure.savefig(path)
         plt.close(figure)
     return path

@@ -52,3 +52,17 @@ def test_the_grasped_end_goes_where_it_is_told_and_the_cable_follows():
 def test_an_unknown_observation_is_refused():
     with pytest.raises(ValueError, match="'mask' or 'rgb', got 'depth'"):
         CableRoutingEnv(observation="depth")
+
+
+@pytest.mark.parametrize("way", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_the_grasped_end_stays_in_the_picture(way):
+    env = CableRoutingEnv(num_worlds=1, seed=0)
+    td = env.reset()
+    state = env._state
+    for _ in range(25):
+        state = env.physics(state, env._control(state, 0.02 * torch.tensor([way], dtype=torch.float64)))
+    x, y = state[0, :2].tolist()
+    assert abs(x) < 0.19
+    assert -0.21 < y < 0.17
+    assert env._segment(env._view(state)).any()
+    assert td["pixels"].any()

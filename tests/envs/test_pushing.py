@@ -60,3 +60,23 @@ def test_the_hand_goes_where_it_is_told_and_takes_a_block_along():
     moved = block_positions(td["next", "state"])[0, :, 1]
     assert moved[1] > 0.05
     assert moved[[0, 2]].abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("way", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_the_hand_stays_on_the_table_and_its_tip_in_the_picture(way):
+    env = SequentialPushingEnv(num_worlds=1, seed=0)
+    td = env.reset()
+    for _ in range(15):
+        td = step_mdp(env.step(td.set("action", 0.05 * torch.tensor([way], dtype=torch.float32))))
+    x, y = hand_position(td["state"])[0].tolist()
+    assert abs(x) < TABLE[0] - 0.02
+    assert abs(y) < TABLE[1] - 0.01
+    view = env._view(env._state)
+    assert (view.geoms == env.model.geom("hand").id).sum() + (view.geoms == env.model.geom("arm").id).sum() >= 8
+
+
+def test_the_arm_is_a_picture_only():
+    arm = SequentialPushingEnv(num_worlds=1, seed=0).model.geom("arm")
+    assert int(arm.contype[0]) == int(arm.conaffinity[0]) == 0
+    env = SequentialPushingEnv(num_worlds=1, seed=0)
+    assert float(env.model.body("hand").mass[0]) == pytest.approx(0.5)
