@@ -47,6 +47,15 @@ def probe(agent: LS3Agent, offline: list[TensorDictBase], evaluation: TensorDict
     return {"state_error": round(latents.error, 3), f"imagined_{horizon}_steps_error": round(imagined, 3)}
 
 
+def best_update(online: list[dict[str, torch.Tensor]]) -> int:
+    """Number of the update whose episodes violated least and, among those, returned most; the later of equals."""
+    ranks = [
+        (-float(figures["violation"].float().mean()), float(figures["return"].float().mean()), update)
+        for update, figures in enumerate(online)
+    ]
+    return max(ranks)[-1]
+
+
 def train(config: DictConfig) -> dict:
     """Run the recipe.
 
@@ -139,6 +148,11 @@ def train(config: DictConfig) -> dict:
     bar.close()
     if updates > 0:
         collector.shutdown()
+    if config.online.select == "best" and online:
+        # An agent that acted, and is known by its episodes; the last one never did.
+        best = best_update(online)
+        agent.load_state_dict(LS3Agent.load(run.path / "checkpoints" / f"agent_{best:03d}.pt").state_dict())
+        console.print(f"agent.pt is the agent of update {best + 1}, whose episodes went best")
     path = agent.save(run.path / "agent.pt")
 
     with timed(seconds, "evaluation"):

@@ -20,6 +20,7 @@ def check_settings(config: DictConfig) -> None:
         "vae.reduction": (vae.reduction, ("mean", "sum")),
         "vae.autocast": (vae.autocast, (True, False, "auto")),
         "optim.autocast": (config.optim.autocast, (True, False, "auto")),
+        "online.select": (config.online.select, ("last", "best")),
         "loss.failure_rows": (config.loss.failure_rows, ("all", "violating")),
     }
     for name, (value, choices) in allowed.items():

@@ -331,3 +331,23 @@ def test_the_seed_decides_a_run(ls3, tmp_path):
     assert one[:2] == two[:2]
     assert all(torch.equal(one[2][name], two[2][name]) for name in one[2])
     assert not all(torch.equal(one[2][name], other[2][name]) for name in one[2])
+
+
+def test_the_best_update_violates_least_then_returns_most_and_is_the_latest_of_equals(ls3):
+    def figures(violation, *returns):
+        return {"violation": torch.tensor(violation).bool(), "return": torch.tensor(returns)}
+
+    rounds = [figures([0, 1], -9.0, -9.0), figures([0, 0], -40.0, -50.0), figures([0, 0], -44.0, -46.0)]
+    assert ls3.best_update(rounds) == 2
+    assert ls3.best_update(rounds[:2]) == 1
+    assert ls3.best_update(rounds[:1]) == 0
+
+
+@pytest.mark.parametrize("select", ["last", "best"])
+def test_the_agent_that_is_kept_is_the_one_that_was_selected(ls3, monkeypatch, tmp_path, select):
+    monkeypatch.setattr(ls3, "best_update", lambda online: 1)
+    ls3.train(configure("preset=smoke", f"online.select={select}", "pictures=false", f"output={tmp_path / 'run'}"))
+    kept = LS3Agent.load(tmp_path / "run" / "agent.pt").state_dict()
+    agents = [LS3Agent.load(path).state_dict() for path in sorted((tmp_path / "run" / "checkpoints").glob("*.pt"))]
+    same = [all(torch.equal(kept[key], agent[key]) for key in kept) for agent in agents]
+    assert same == ([False, True, False] if select == "best" else [False, False, True])
