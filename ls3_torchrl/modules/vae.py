@@ -24,6 +24,8 @@ from ls3_torchrl._checks import require_at_least, require_finite, require_keys, 
 IMAGE_SIZE = 64
 _FEATURES = 256
 _INITIAL_LOG_SCALE = -3.0
+#: Output channels that fill too little of a vector for a transposed convolution to be fast.
+_FEW_CHANNELS = 16
 
 
 def as_unit_pixels(pixels: Tensor, channels: int) -> Tensor:
@@ -75,13 +77,10 @@ class _TransposedConvolution(torch.autograd.Function):
     pixel as channels (Shi et al. 2016, arXiv 1609.07009).
     """
 
-    #: Output channels that fill too little of a vector for a transposed convolution to be fast.
-    FEW = 16
-
     @staticmethod
     def forward(input: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
         channels, kernel = weight.shape[1], weight.shape[-1]
-        if channels >= _TransposedConvolution.FEW or kernel % stride:
+        if channels >= _FEW_CHANNELS or kernel % stride:
             return nn.functional.conv_transpose2d(input, weight, bias, stride)
         # out[s q + r] = Σ_j in[q - j] w[s j + r]: for each r a convolution with every s-th tap, last to first.
         taps = kernel // stride

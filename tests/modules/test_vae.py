@@ -273,3 +273,17 @@ def test_a_background_is_added_to_what_the_network_draws_and_is_kept_with_it():
     assert "background" not in plain.state_dict()
     with pytest.raises(RuntimeError, match="background=True"):
         plain.set_background(image)
+
+
+def test_the_decoder_compiles_as_one_graph_with_the_same_gradients():
+    torch.manual_seed(0)
+    decoder = PixelDecoder(latent_dim=4)
+    latent = torch.randn(3, 4)
+
+    def error(latent: torch.Tensor) -> torch.Tensor:
+        return decoder.network(latent).square().mean()
+
+    compiled = torch.compile(error, fullgraph=True, backend="aot_eager")
+    results = [torch.autograd.grad(f(latent), list(decoder.parameters())) for f in (error, compiled)]
+    for ours, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, theirs)
