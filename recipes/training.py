@@ -187,12 +187,12 @@ class Training:
         }
         self.dynamics = Learner(
             "dynamics",
-            EnsembleDynamicsLoss(agent.dynamics, bootstrap=bootstrap, steps=loss.dynamics_steps),
+            EnsembleDynamicsLoss(agent.dynamics, bootstrap=bootstrap, steps=loss.dynamics_horizon),
             draw(
                 ALL_TAGS,
                 members,
                 without=self._left_out,
-                steps=loss.dynamics_steps if loss.dynamics_steps > 1 else None,
+                steps=loss.dynamics_horizon if loss.dynamics_horizon > 1 else None,
             ),
             lr=optim.dynamics_lr,
             **how,
@@ -282,7 +282,7 @@ class Training:
         def draw(count: int) -> TensorDictBase:
             if not weight:
                 return self.buffer.sample_pixels(count)
-            steps = options.prediction_steps
+            steps = options.prediction_horizon
             return self.buffer.sample_pixel_transitions(
                 count, without=self._left_out, steps=steps if steps > 1 else None
             )

@@ -41,8 +41,8 @@ def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_horizon(conf
         ("optim.lr", -1.0),
         ("online.episodes_per_update", 0),
         ("online.select", "first"),
-        ("vae.prediction_steps", 0),
-        ("loss.dynamics_steps", 0),
+        ("vae.prediction_horizon", 0),
+        ("loss.dynamics_horizon", 0),
     ],
 )
 def test_settings_that_would_fail_late_are_refused_early(config, name, value):
