@@ -45,6 +45,7 @@ class AgentArchitecture:
     initial_value: float = 0.0
     propagation: Literal["ts1", "tsinf"] = "ts1"
     control_affine: bool = False
+    action_scale: float | tuple[float, ...] = 1.0
     background: bool = False
 
 
@@ -63,6 +64,7 @@ class LS3Agent(nn.Module):
         initial_value: where the value networks' output biases start.
         propagation: ``"ts1"`` or ``"tsinf"``.
         control_affine: the dynamics' change of the latent is affine in the action.
+        action_scale: unit of the actions in the dynamics, one number or one for each of A.
         background: the decoder draws on top of a fixed image.
 
     Raises:
@@ -94,6 +96,7 @@ class LS3Agent(nn.Module):
         initial_value: float = 0.0,
         propagation: Literal["ts1", "tsinf"] = "ts1",
         control_affine: bool = False,
+        action_scale: float | Sequence[float] = 1.0,
         background: bool = False,
     ) -> None:
         super().__init__()
@@ -115,6 +118,7 @@ class LS3Agent(nn.Module):
             initial_value=initial_value,
             propagation=propagation,
             control_affine=control_affine,
+            action_scale=tuple(action_scale) if isinstance(action_scale, Sequence) else action_scale,
             background=background,
         )
         self.encoder = PixelEncoder(in_channels, latent_dim)
@@ -126,6 +130,7 @@ class LS3Agent(nn.Module):
             hidden=dynamics_hidden,
             propagation=propagation,
             control_affine=control_affine,
+            action_scale=action_scale,
         )
         self.value = ValueEnsemble(latent_dim, num_members=num_values, hidden=value_hidden, initial_value=initial_value)
         self.safe_set = SafeSet(latent_dim, hidden=classifier_hidden)

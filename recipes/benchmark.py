@@ -30,7 +30,7 @@ from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeS
 from ls3_torchrl.planners import ImaginationNoise, LS3Planner
 from plain import PlainVAE, plain_members
 from timing import Bench, matmul_peak, show
-from training import threads
+from learning import threads
 
 
 def permissive(agent: LS3Agent) -> LS3Agent:

@@ -37,7 +37,7 @@ def evaluate(config: DictConfig) -> dict:
     planner = agent.planner(action_spec, **{str(key): value for key, value in planner_options.items()})
     config.planner = planner_options
     run = RunFolder(config.output, config)
-    episodes = run_episodes(trained, planner, config.episodes, config.seed, device, what="Evaluation")
+    episodes = run_episodes(world, planner, what="Evaluation")
     summary = {
         "task": trained.task.name,
         "preset": trained.preset,

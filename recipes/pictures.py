@@ -41,36 +41,52 @@ STYLE: Any = {
 }
 
 
-def draw_all(
+def draw_run(
     folder: Path,
     config: DictConfig,
-    agent: LS3Agent,
-    planner: LS3Planner,
     offline: dict[Tag, TensorDictBase],
     tracks: list[Tensor],
     evaluation: TensorDictBase,
 ) -> None:
-    """Every picture of a run, into its folder.
+    """The pictures that a run of any algorithm leaves, into its folder.
 
     Args:
         folder: the run's folder.
         config: its configuration.
-        agent: the trained agent.
-        planner: its policy.
         offline: the demonstrations by tag.
         tracks: states ``[N, T, S]`` of the online episodes, one entry an update.
         evaluation: the evaluation episodes ``[N, T]``.
     """
     with plt.rc_context(STYLE), torch.no_grad():
         learning_curves(folder)
-        reconstructions(folder, agent, offline)
         film(folder / "evaluation.gif", evaluation)
-        timelines(folder, agent, planner, offline, evaluation)
-        env = ls3_envs.make(config.task.name, num_worlds=1, seed=config.seed).base_env
-        if env.plane() is not None:
-            maps(folder, env, agent, planner, offline)
+        env = plane_of(config)
+        if env is not None:
             paths(folder, env, offline, tracks, evaluation)
+
+
+def draw_agent(
+    folder: Path,
+    config: DictConfig,
+    agent: LS3Agent,
+    planner: LS3Planner,
+    offline: dict[Tag, TensorDictBase],
+    evaluation: TensorDictBase,
+) -> None:
+    """What an LS³ agent knows and plans. Arguments as for :func:`draw_run`, with the agent and its policy."""
+    with plt.rc_context(STYLE), torch.no_grad():
+        reconstructions(folder, agent, offline)
+        timelines(folder, agent, planner, offline, evaluation)
+        env = plane_of(config)
+        if env is not None:
+            maps(folder, env, agent, planner, offline)
             plans(folder, env, agent, planner, evaluation)
+
+
+def plane_of(config: DictConfig) -> ls3_envs.VisualConstraintEnv | None:
+    """The task's environment, where its states are a plane that maps can be drawn of."""
+    env = ls3_envs.make(config.task.name, num_worlds=1, seed=config.seed).base_env
+    return None if env.plane() is None else env
 
 
 def learning_curves(folder: Path) -> None:

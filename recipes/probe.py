@@ -11,7 +11,7 @@ from torchrl.modules import MLP
 
 from common import progress
 from ls3_torchrl import LS3Agent
-from training import threads
+from learning import threads
 
 
 class StateProbe:

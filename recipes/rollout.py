@@ -1,16 +1,16 @@
-"""Environments as the recipes use them, demonstrations, and episodes of a trained agent."""
+"""Environments as the recipes use them, demonstrations, and episodes of a trained policy."""
 
 from __future__ import annotations
 
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from torchrl.envs import TransformedEnv
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 import ls3_envs
 from common import console, progress, tick
 from ls3_torchrl.data import Tag
-from ls3_torchrl.planners import LS3Planner
 
 
 def make_env(config: DictConfig, worlds: int, seed: int, device: torch.device) -> TransformedEnv:
@@ -45,21 +45,11 @@ def whole_episodes(episodes: TensorDictBase) -> TensorDictBase:
     return episodes[sound]
 
 
-def run_episodes(
-    config: DictConfig,
-    planner: LS3Planner,
-    episodes: int,
-    seed: int,
-    device: torch.device,
-    *,
-    what: str,
-) -> TensorDictBase:
-    """Whole episodes ``[N, T]`` of the agent, side by side in as many worlds."""
-    env = make_env(config, episodes, seed, device)
-    env.append_transform(planner.primer())
+def run_episodes(env: TransformedEnv, policy: TensorDictModuleBase, *, what: str) -> TensorDictBase:
+    """Whole episodes ``[N, T]`` of a policy, at its best rather than exploring, side by side in the env's worlds."""
     horizon = env.base_env.horizon
-    with progress(horizon, what) as bar, torch.no_grad():
-        ticking = planner.register_forward_hook(lambda *_: tick(bar))
-        out = env.rollout(horizon, planner, break_when_any_done=False)
+    with progress(horizon, what) as bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        ticking = policy.register_forward_hook(lambda *_: tick(bar))
+        out = env.rollout(horizon, policy, break_when_any_done=False)
         ticking.remove()
     return whole_episodes(out.cpu())

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from omegaconf import DictConfig
+from torchrl.data import Bounded
 
 #: What can learn from the posteriors' means instead of samples.
 MEAN_LATENTS = ("dynamics", "constraint", "goal")
+
+
+def agent_options(config: DictConfig, action_spec: Bounded) -> dict[str, Any]:
+    """The settings of the networks; ``action_scale: box`` stands for half the actions' range."""
+    options = {str(name): value for name, value in config.agent.items()}
+    if options["action_scale"] == "box":
+        space = action_spec.space
+        half = ((space.high - space.low) / 2).reshape(-1, action_spec.shape[-1])[0]
+        options["action_scale"] = half.tolist()
+    return options
 
 
 def check_settings(config: DictConfig) -> None:
@@ -15,6 +28,9 @@ def check_settings(config: DictConfig) -> None:
         ValueError: naming the setting, what was received and what is allowed.
     """
     vae = config.vae
+    scale = config.agent.action_scale
+    if isinstance(scale, str) and scale != "box":
+        raise ValueError(f"agent.action_scale must be box, or one or more positive numbers; got {scale!r}.")
     allowed = {
         "vae.schedule": (vae.schedule, ("constant", "onecycle")),
         "vae.reduction": (vae.reduction, ("mean", "sum")),
@@ -51,6 +67,8 @@ def check_settings(config: DictConfig) -> None:
     for name in ("failure_weight", "undecided_weight"):
         if loss[name] < 0.0:
             raise ValueError(f"loss.{name} must not be negative, got {loss[name]}.")
+    if loss.success_tail is not None and loss.success_tail < 1:
+        raise ValueError(f"loss.success_tail must be null or at least 1, got {loss.success_tail}.")
     unknown = set(loss.mean_latents) - set(MEAN_LATENTS)
     if unknown:
         raise ValueError(

@@ -17,7 +17,7 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from ls3_torchrl._checks import require_at_least, require_finite, require_keys
-from ls3_torchrl.data.labels import failure_tail, frozen, in_success, reward_to_go, undecided
+from ls3_torchrl.data.labels import failure_tail, frozen, in_success, reward_to_go, undecided, without_idle_end
 from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.tags import ALL_TAGS, Tag
 from ls3_torchrl.modules.vae import PixelEncoder
@@ -36,6 +36,8 @@ class TaggedReplayBuffer:
         gamma: γ of the ``reward_to_go`` labels.
         continue_failures: label episodes that never reach the goal as if they went on for ever
             (:func:`~ls3_torchrl.data.failure_tail`), instead of ending with the horizon.
+        success_tail: steps kept of the successes that an episode ends with; ``None`` keeps all. Once the task is done
+            nothing happens, and such steps can be most of the data.
         pixel_capacity: frames kept; ``None`` makes room for the same episodes, frames at both ends included.
         scratch_dir: memory-map both stores below this folder instead of holding them in memory.
         device: where sampled batches live.
@@ -69,6 +71,7 @@ class TaggedReplayBuffer:
         latent_dim: int = 32,
         gamma: float = 0.99,
         continue_failures: bool = False,
+        success_tail: int | None = None,
         pixel_capacity: int | None = None,
         scratch_dir: str | Path | None = None,
         device: torch.device | str = "cpu",
@@ -80,6 +83,7 @@ class TaggedReplayBuffer:
         self.latent_dim = require_at_least(latent_dim, 1, "latent_dim")
         self.gamma = gamma
         self.continue_failures = continue_failures
+        self.success_tail = None if success_tail is None else require_at_least(success_tail, 1, "success_tail")
         self.device = torch.device(device)
         folder = None if scratch_dir is None else Path(scratch_dir)
 
@@ -116,6 +120,8 @@ class TaggedReplayBuffer:
             view.sampler.refresh()
 
     def _add_one(self, episode: TensorDictBase, tag: Tag) -> None:
+        if self.success_tail is not None:
+            episode = episode[: without_idle_end(episode["next", "success"], self.success_tail)]
         steps = episode.shape[0]
         if steps + 1 > self.pixel_capacity or steps > self.capacity:
             raise ValueError(

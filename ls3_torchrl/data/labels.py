@@ -109,3 +109,21 @@ def in_success(success: Tensor) -> Tensor:
     """
     reversed_success = success.flip(-2).to(torch.uint8)
     return reversed_success.cummax(dim=-2).values.flip(-2).bool()
+
+
+def without_idle_end(success: Tensor, tail: int) -> int:
+    """How many steps of a trajectory are left when only ``tail`` of the successes that it ends with are kept.
+
+    Args:
+        success: bool ``[T, 1]``, whether the step's next state lies in the goal set.
+        tail: at least 1.
+
+    Example:
+        >>> done = torch.tensor([[True], [False], [True], [True], [True]])
+        >>> without_idle_end(done, tail=1), without_idle_end(done, tail=9)
+        (3, 5)
+    """
+    steps = len(success)
+    failures = (~success.flatten()).nonzero()
+    last = int(failures[-1]) + 1 if len(failures) else 0
+    return min(last + tail, steps)

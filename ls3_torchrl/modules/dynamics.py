@@ -38,6 +38,8 @@ class EnsembleDynamics(TensorDictModuleBase):
         hidden: sizes of the hidden layers.
         propagation: ``"ts1"`` or ``"tsinf"``.
         control_affine: the change of the latent is affine in the action.
+        action_scale: unit of the actions, one number or one for each of A; the networks see a / ``action_scale``. Half
+            the action's range is a good one: a displacement of centimetres in metres is all but invisible to them.
         log_scale_bounds: range that the log standard deviation is clamped to.
         latent_key: latent ``[*B, D]``.
         action_key: action ``[*B, A]``, in the environment's units.
@@ -46,7 +48,7 @@ class EnsembleDynamics(TensorDictModuleBase):
         noise_key: standard normal noise ``[*B, D]``; drawn when absent.
 
     Raises:
-        ValueError: for an unknown propagation.
+        ValueError: for an unknown propagation, or an ``action_scale`` that is not positive or not of size A.
         KeyError: when latent or action is missing.
 
     Source: Chua et al., "Deep Reinforcement Learning in a Handful of Trials", section 5 and appendix.
@@ -69,6 +71,7 @@ class EnsembleDynamics(TensorDictModuleBase):
         hidden: Sequence[int] = (128, 128),
         propagation: Propagation = "ts1",
         control_affine: bool = False,
+        action_scale: float | Sequence[float] = 1.0,
         log_scale_bounds: tuple[float, float] = (-8.0, 4.0),
         latent_key: NestedKey = "latent",
         action_key: NestedKey = "action",
@@ -85,6 +88,12 @@ class EnsembleDynamics(TensorDictModuleBase):
         self.propagation: Propagation = propagation
         self.control_affine = control_affine
         self.log_scale_bounds = (float(low), float(high))
+        scale = torch.as_tensor(action_scale, dtype=torch.float32)
+        if scale.ndim > 1 or scale.numel() not in (1, action_dim) or not (scale > 0).all():
+            raise ValueError(
+                f"action_scale must be one positive number or one for each of {action_dim} actions, got {action_scale}."
+            )
+        self.register_buffer("action_scale", scale, persistent=False)
         self.in_keys = [latent_key, action_key]
         self.out_keys = [next_latent_key]
         self.member_key, self.noise_key = member_key, noise_key
@@ -95,7 +104,7 @@ class EnsembleDynamics(TensorDictModuleBase):
 
     def network_input(self, latent: Tensor, action: Tensor) -> Tensor:
         """What the network sees of a latent ``[*B, D]`` and an action ``[*B, A]``."""
-        return latent if self.control_affine else torch.cat([latent, action], -1)
+        return latent if self.control_affine else torch.cat([latent, action / self.action_scale], -1)
 
     def read_output(self, output: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """The mean change of the latent and its log standard deviation, each ``[*B, D]``.
@@ -111,7 +120,8 @@ class EnsembleDynamics(TensorDictModuleBase):
             drift, log_scale, gain = output.split(
                 [self.latent_dim, self.latent_dim, self.latent_dim * self.action_dim], -1
             )
-            delta = drift + (gain.unflatten(-1, (self.latent_dim, self.action_dim)) * action.unsqueeze(-2)).sum(-1)
+            unit = (action / self.action_scale).unsqueeze(-2)
+            delta = drift + (gain.unflatten(-1, (self.latent_dim, self.action_dim)) * unit).sum(-1)
         return delta, log_scale.clamp(*self.log_scale_bounds)
 
     def distribution(self, latent: Tensor, action: Tensor, *, per_member: bool = False) -> tuple[Tensor, Tensor]:

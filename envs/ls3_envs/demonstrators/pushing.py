@@ -29,7 +29,10 @@ def _steer(state: Tensor, block: Tensor, speed: float) -> Tensor:
 
 
 class PushingDemonstrator(Scripted):
-    """Guides the hand to the first block that is not in its goal and pushes it there, straight and slowly.
+    """Guides the hand to one block after another and pushes it to its goal, straight and slowly.
+
+    The blocks' order is drawn for each episode: with always the same one, the hand's place alone would tell how much
+    is done, and values learnt from such demonstrations look at the hand and not at the blocks.
 
     Args:
         noise_std: standard deviation of the noise on the displacements, in metres.
@@ -44,19 +47,22 @@ class PushingDemonstrator(Scripted):
         True
     """
 
-    def __init__(self, *, noise_std: float = 0.004, seed: int = 0) -> None:
+    def __init__(self, *, noise_std: float = 0.006, seed: int = 0) -> None:
         super().__init__(limit=MAX_STEP, noise_std=noise_std, seed=seed)
 
     def _act(self, state: Tensor, step: Tensor, is_init: Tensor) -> Tensor:
         waiting = block_positions(state)[..., 1] <= GOAL_Y + 0.004
-        action = _steer(state, waiting.int().argmax(-1), speed=0.012)
+        order = self._for_the_episode("order", self._uniform(state, 3), is_init)
+        action = _steer(state, order.masked_fill(~waiting, 2.0).argmin(-1), speed=0.012)
         retreat = torch.zeros_like(action)
         retreat[:, 1] = (_CLEAR_Y - hand_position(state)[:, 1]).clamp(min=-MAX_STEP)
         return torch.where(waiting.any(-1, keepdim=True), action, retreat)
 
 
 class PushingViolator(Scripted):
-    """Pushes a random block on and on, with bursts of uniform actions in between: random and violating data.
+    """Pushes blocks on and on, with bursts of uniform actions in between: random and violating data.
+
+    Each stretch between two bursts has a block of its own, drawn at random.
 
     Use it with ``SequentialPushingEnv(start="random")``.
 
@@ -74,15 +80,19 @@ class PushingViolator(Scripted):
         torch.Size([2, 3])
     """
 
-    def __init__(self, *, burst: float = 0.2, calm: float = 0.1, noise_std: float = 0.004, seed: int = 0) -> None:
+    def __init__(self, *, burst: float = 0.1, calm: float = 0.1, noise_std: float = 0.004, seed: int = 0) -> None:
         super().__init__(limit=MAX_STEP, noise_std=noise_std, seed=seed)
         self.burst, self.calm = burst, calm
 
     def _act(self, state: Tensor, step: Tensor, is_init: Tensor) -> Tensor:
-        block = self._for_the_episode("block", self._uniform(state, 1, 0.0, 3.0), is_init).long().squeeze(-1)
+        any_block = self._uniform(state, 1, 0.0, 3.0)
+        block = self._for_the_episode("block", any_block, is_init)
         bursting = self._for_the_episode("bursting", torch.zeros_like(state[:, :1]), is_init) > 0.5
         chance = self._uniform(state, 1)
-        bursting = torch.where(bursting, chance >= self.calm, chance < self.burst)
-        self._kept["bursting"] = bursting.to(state)
+        ends = bursting & (chance < self.calm)
+        bursting = torch.where(bursting, ~ends, chance < self.burst)
+        # After each burst another block: the data hold every order of blocks, not the demonstrations' alone.
+        block = torch.where(ends, any_block, block)
+        self._kept["block"], self._kept["bursting"] = block, bursting.to(state)
         uniform = self._uniform(state, 2, -MAX_STEP, MAX_STEP)
-        return torch.where(bursting, uniform, _steer(state, block, speed=0.04))
+        return torch.where(bursting, uniform, _steer(state, block.long().squeeze(-1), speed=0.04))

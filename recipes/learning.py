@@ -1,0 +1,130 @@
+"""A learner: one loss, its optimiser, its lagged target and its batches; what every phase of training is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import HardUpdate, LossModule
+
+from common import RunFolder, progress
+from ls3_torchrl.planners.layers import fastest_precision
+
+LOG_EVERY = 100
+
+
+@contextmanager
+def threads(count: int | None) -> Iterator[None]:
+    """Compute on ``count`` cores; on as many as before when ``None``."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def wants_bf16(setting: bool | str, device: torch.device) -> bool:
+    """What a setting ``autocast`` of true, false or auto means on a device."""
+    return fastest_precision(device.type) == "bf16" if setting == "auto" else bool(setting)
+
+
+def cooled_down(share: float, cooldown: float) -> float:
+    """What a learning rate has fallen to after a share of a phase's steps: 1, then linearly to 0 at the end."""
+    return 1.0 if share < 1.0 - cooldown else (1.0 - share) / cooldown
+
+
+class Term(NamedTuple):
+    """A second loss on the same network, with batches of its own.
+
+    Attributes:
+        weight: of its value in the sum.
+        loss: the loss module.
+        sample: draws a batch for it.
+    """
+
+    weight: float
+    loss: LossModule
+    sample: Callable[[], TensorDictBase]
+
+
+class Learner:
+    """One loss, its optimiser, its lagged target and where its batches come from.
+
+    Args:
+        name: the loss is ``loss_{name}``.
+        loss: a TorchRL loss module.
+        sample: draws a batch.
+        lr: Adam's learning rate.
+        target_interval: gradient steps between copies to the target network; ``None`` without one.
+        beside: a second loss that is added to the first.
+        bf16: compute the losses under bf16 autocast; weights, gradients and optimiser stay fp32.
+        cooldown: share of a phase's steps, at its end, over which the learning rate falls linearly to nothing: the
+            last few batches then sway what the agent acts by no more than the others.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        loss: LossModule,
+        sample: Callable[[], TensorDictBase],
+        *,
+        lr: float,
+        target_interval: int | None = None,
+        beside: Term | None = None,
+        bf16: bool = False,
+        cooldown: float = 0.0,
+    ) -> None:
+        self.name, self.loss, self.sample, self.beside, self.bf16 = name, loss, sample, beside, bf16
+        self.lr, self.cooldown = lr, cooldown
+        self.parameters = [p for p in loss.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True)
+        self.target_interval = target_interval
+        self.target: HardUpdate | None = None
+        self.steps = 0
+
+    def evaluate(self) -> tuple[TensorDictBase, Tensor]:
+        """What the losses write for a new batch, and the sum that is descended."""
+        rows = self.sample()
+        second = None if self.beside is None else self.beside.sample()
+        with torch.autocast(self.parameters[0].device.type, torch.bfloat16, enabled=self.bf16):
+            losses = self.loss(rows)
+            value = losses[f"loss_{self.name}"]
+            if self.beside is not None:
+                beside = self.beside.loss(second)[f"loss_{self.name}"]
+                losses["beside"] = beside.detach()
+                value = value + self.beside.weight * beside
+        return losses, value
+
+    def train(self, steps: int, what: str, run: RunFolder) -> None:
+        """Take ``steps`` gradient steps."""
+        if self.target_interval is not None and self.target is None:
+            # Made at the first step, not before: it copies the network to its target, and another learner may have
+            # trained that network meanwhile (reward-to-go before TD-1). It copies again at calls k + 1, 2(k + 1), …,
+            # so k is one less than the interval that is meant.
+            self.target = HardUpdate(self.loss, value_network_update_interval=self.target_interval - 1)
+        # Networks of this size lose more by waking a second core than they gain by it.
+        with threads(1), progress(steps, what) as bar:
+            for i in range(steps):
+                for group in self.optimizer.param_groups:
+                    group["lr"] = self.lr * cooled_down(i / steps, self.cooldown)
+                losses, value = self.evaluate()
+                self.optimizer.zero_grad()
+                value.backward()
+                self.optimizer.step()
+                if self.target is not None:
+                    self.target.step()
+                self.steps += 1
+                if i % LOG_EVERY == 0 or i == steps - 1:
+                    scalars = {key: item.item() for key, item in losses.items()}
+                    if not all(map(torch.isfinite, losses.values())):
+                        raise FloatingPointError(
+                            f"{what} diverged: {scalars} at step {self.steps}. Lower its learning rate."
+                        )
+                    bar.set_postfix_str(f"loss {value.item():.4g}", refresh=False)
+                    run.log(what, self.steps, **scalars)
+                bar.update()
