@@ -23,6 +23,7 @@ from torchrl.objectives import HardUpdate
 
 import ls3_envs
 from common import RunFolder, choose_device, console, hardware
+from learning import threads
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.modules.ensemble import EnsembleMLP
@@ -30,7 +31,6 @@ from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeS
 from ls3_torchrl.planners import ImaginationNoise, LS3Planner
 from plain import PlainVAE, plain_members
 from timing import Bench, matmul_peak, show
-from learning import threads
 
 
 def permissive(agent: LS3Agent) -> LS3Agent:

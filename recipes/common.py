@@ -82,6 +82,19 @@ class RunFolder:
         self._tensorboard.close()
 
 
+def write_atomically(content: dict, path: str | Path) -> Path:
+    """Save tensors in one go: a half-written file never takes the place of a whole one."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        torch.save(content, file)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+    return path
+
+
 def read_metrics(folder: str | Path) -> list[dict[str, str]]:
     """The rows of a run's ``metrics.csv``."""
     with (Path(folder) / "metrics.csv").open(newline="") as file:
@@ -165,7 +178,7 @@ def choose_device(name: str) -> torch.device:
 
 def print_summary(summary: dict, folder: Path) -> None:
     """The final table on the terminal."""
-    table = Table(title=f"{summary['task']}, preset {summary['preset']}, seed {summary['seed']}")
+    table = Table(title="{algorithm} on {task}, preset {preset}, seed {seed}".format(**summary))
     for column in ("", "episodes", "success", "violation", "return"):
         table.add_column(column, justify="left" if not column else "right")
     for part in ("demonstrations", "online", "evaluation"):

@@ -1,4 +1,4 @@
-"""Evaluate a trained agent of a run folder."""
+"""Evaluate what a run of any recipe has trained."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from omegaconf import DictConfig, OmegaConf
 
 import pictures
 from common import RunFolder, choose_device, episode_figures, hardware, print_summary, summarise
-from ls3_torchrl import LS3Agent
+from comparisons import COMPARISONS
+from ls3 import LS3
+from protocol import Algorithm
 from rollout import make_env, run_episodes
+
+ALGORITHMS: dict[str, type[Algorithm]] = {"ls3": LS3, **COMPARISONS}
 
 
 def evaluate(config: DictConfig) -> dict:
-    """Run episodes of a trained agent.
+    """Run episodes of a trained policy.
 
     Args:
         config: the resolved configuration of ``conf/evaluate.yaml``.
@@ -29,16 +33,22 @@ def evaluate(config: DictConfig) -> dict:
     device = choose_device(config.device)
     trained = OmegaConf.load(folder / "config.yaml")
     assert isinstance(trained, DictConfig)
-    planner_options = OmegaConf.merge(trained.planner, config.planner)
-    assert isinstance(planner_options, DictConfig)
+    name = trained.get("algorithm", "ls3")
+    if name == "ls3":
+        trained.planner = config.planner = OmegaConf.merge(trained.planner, config.planner)
+    elif config.planner:
+        raise ValueError(
+            f"{folder} is a run of {name}, which has no planner: planner={dict(config.planner)} is in vain."
+        )
     torch.manual_seed(config.seed)
-    action_spec = make_env(trained, 1, config.seed, device).action_spec
-    agent = LS3Agent.load(folder / config.agent, device=device, action_dim=action_spec.shape[-1])
-    planner = agent.planner(action_spec, **{str(key): value for key, value in planner_options.items()})
-    config.planner = planner_options
+    world = make_env(trained, config.episodes, config.seed, device)
+    algorithm = ALGORITHMS[name](trained, world, device)
+    algorithm.prepare(world)
+    algorithm.restore(folder / config.agent)
     run = RunFolder(config.output, config)
-    episodes = run_episodes(world, planner, what="Evaluation")
+    episodes = run_episodes(world, algorithm.policy, what="Evaluation")
     summary = {
+        "algorithm": algorithm.name,
         "task": trained.task.name,
         "preset": trained.preset,
         "seed": config.seed,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives import HardUpdate, LossModule
+from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 
 from common import RunFolder, progress
 from ls3_torchrl.planners.layers import fastest_precision
@@ -53,14 +54,15 @@ class Term(NamedTuple):
 
 
 class Learner:
-    """One loss, its optimiser, its lagged target and where its batches come from.
+    """One loss module, its optimiser, its lagged target and where its batches come from.
 
     Args:
-        name: the loss is ``loss_{name}``.
+        names: the losses ``loss_{name}`` are descended, in one step if there are several.
         loss: a TorchRL loss module.
         sample: draws a batch.
         lr: Adam's learning rate.
         target_interval: gradient steps between copies to the target network; ``None`` without one.
+        tau: share of the way that the target network moves at every step instead.
         beside: a second loss that is added to the first.
         bf16: compute the losses under bf16 autocast; weights, gradients and optimiser stay fp32.
         cooldown: share of a phase's steps, at its end, over which the learning rate falls linearly to nothing: the
@@ -69,22 +71,24 @@ class Learner:
 
     def __init__(
         self,
-        name: str,
+        names: str | Sequence[str],
         loss: LossModule,
         sample: Callable[[], TensorDictBase],
         *,
         lr: float,
         target_interval: int | None = None,
+        tau: float | None = None,
         beside: Term | None = None,
         bf16: bool = False,
         cooldown: float = 0.0,
     ) -> None:
-        self.name, self.loss, self.sample, self.beside, self.bf16 = name, loss, sample, beside, bf16
+        self.names = [names] if isinstance(names, str) else list(names)
+        self.loss, self.sample, self.beside, self.bf16 = loss, sample, beside, bf16
         self.lr, self.cooldown = lr, cooldown
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True)
-        self.target_interval = target_interval
-        self.target: HardUpdate | None = None
+        self.target_interval, self.tau = target_interval, tau
+        self.target: HardUpdate | SoftUpdate | None = None
         self.steps = 0
 
     def evaluate(self) -> tuple[TensorDictBase, Tensor]:
@@ -93,15 +97,17 @@ class Learner:
         second = None if self.beside is None else self.beside.sample()
         with torch.autocast(self.parameters[0].device.type, torch.bfloat16, enabled=self.bf16):
             losses = self.loss(rows)
-            value = losses[f"loss_{self.name}"]
+            value = torch.stack([losses[f"loss_{name}"] for name in self.names]).sum()
             if self.beside is not None:
-                beside = self.beside.loss(second)[f"loss_{self.name}"]
+                beside = self.beside.loss(second)[f"loss_{self.names[0]}"]
                 losses["beside"] = beside.detach()
                 value = value + self.beside.weight * beside
         return losses, value
 
     def train(self, steps: int, what: str, run: RunFolder) -> None:
         """Take ``steps`` gradient steps."""
+        if self.tau is not None and self.target is None:
+            self.target = SoftUpdate(self.loss, tau=self.tau)
         if self.target_interval is not None and self.target is None:
             # Made at the first step, not before: it copies the network to its target, and another learner may have
             # trained that network meanwhile (reward-to-go before TD-1). It copies again at calls k + 1, 2(k + 1), …,
@@ -120,8 +126,8 @@ class Learner:
                     self.target.step()
                 self.steps += 1
                 if i % LOG_EVERY == 0 or i == steps - 1:
-                    scalars = {key: item.item() for key, item in losses.items()}
-                    if not all(map(torch.isfinite, losses.values())):
+                    scalars = {key: item.item() for key, item in losses.items() if item.numel() == 1}
+                    if not all(map(math.isfinite, scalars.values())):
                         raise FloatingPointError(
                             f"{what} diverged: {scalars} at step {self.steps}. Lower its learning rate."
                         )

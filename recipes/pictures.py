@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 
@@ -79,7 +80,7 @@ def draw_agent(
         timelines(folder, agent, planner, offline, evaluation)
         env = plane_of(config)
         if env is not None:
-            maps(folder, env, agent, planner, offline)
+            maps(folder, env, agent_fields(env, agent, planner), offline)
             plans(folder, env, agent, planner, evaluation)
 
 
@@ -151,13 +152,9 @@ def _device(agent: LS3Agent) -> torch.device:
     return next(agent.parameters()).device
 
 
-def _encode_states(env: ls3_envs.VisualConstraintEnv, agent: LS3Agent, states: Tensor) -> Tensor:
-    """Latents ``[n, D]`` of the images of states ``[n, S]``."""
-    parts = [
-        agent.encoder(TensorDict({"pixels": env.render_states(part).to(_device(agent))}, [len(part)]))["latent"]
-        for part in states.split(512)
-    ]
-    return torch.cat(parts)
+def _encode(agent: LS3Agent, pixels: Tensor) -> TensorDictBase:
+    """What the encoder makes of images ``[n, C, S, S]``."""
+    return agent.encoder(TensorDict({"pixels": pixels.to(_device(agent))}, [len(pixels)]))
 
 
 def _line(track: Tensor) -> np.ndarray:
@@ -173,51 +170,75 @@ def _wall(axis: Axes, extent: tuple[float, float, float, float]) -> None:
     axis.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[], aspect="equal")
 
 
-@torch.no_grad()
+class Field(NamedTuple):
+    """One map over the plane.
+
+    Attributes:
+        values: ``[n]``, one for each state of the plane.
+        colours: name of a colour map.
+        limits: of the colours; the values' own when ``None``.
+        level: where a line is drawn.
+    """
+
+    values: Tensor
+    colours: str
+    limits: tuple[float, float] | None = None
+    level: float | None = None
+
+
+def over_plane(env: ls3_envs.VisualConstraintEnv, judge: Callable[[Tensor], TensorDictBase]) -> TensorDictBase:
+    """What ``judge`` says of the images ``[n, C, S, S]`` of all states of the plane."""
+    plane = env.plane()
+    assert plane is not None
+    states = plane[0].flatten(0, -2)
+    return torch.cat([judge(env.render_states(part)) for part in states.split(512)])
+
+
 def maps(
     folder: Path,
     env: ls3_envs.VisualConstraintEnv,
-    agent: LS3Agent,
-    planner: LS3Planner,
+    fields: dict[str, Field],
     offline: dict[Tag, TensorDictBase],
 ) -> None:
-    """Value, spread of the values, safe set, constraint and goal all over the plane, demonstrations drawn in."""
+    """Fields over the plane, demonstrations drawn in."""
     plane = env.plane()
     assert plane is not None
     grid, extent = plane
-    latent = _encode_states(env, agent, grid.reshape(-1, grid.shape[-1]))
-    td = agent.value(TensorDict({"latent": latent}, [len(latent)]))
-    values = td["state_value"].squeeze(-1)
-    panels = (
-        ("Value V", values.mean(-1), "viridis", None, None),
-        ("Spread of V over members", values.std(-1), "magma", None, None),
-        ("Safe set $f_S$", agent.safe_set.probability(latent), "BuGn", (0, 1), planner.safe_set_threshold),
-        (
-            "Constraint $f_C$",
-            agent.constraint.probability(latent),
-            "OrRd",
-            (0, 1),
-            planner.constraint_threshold,
-        ),
-        ("Goal $f_G$", agent.goal.probability(latent), "Blues", (0, 1), 0.5),
-    )
-    figure, axes = plt.subplots(1, len(panels), figsize=(16, 3.0))
-    for axis, (title, field, colours, limits, level) in zip(axes, panels, strict=True):
-        picture = field.reshape(grid.shape[:2]).cpu().numpy()
-        low, high = limits or (picture.min(), picture.max())
-        image = axis.imshow(picture, extent=extent, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
-        if level is not None and picture.min() < level < picture.max():
-            x, y = grid.unbind(-1)
-            axis.contour(x.numpy(), y.numpy(), picture, levels=[level], colors=INK, linewidths=0.8)
-        for tag, colour in ((Tag.SUCCESS, SAFE), (Tag.CONSTRAINT, UNSAFE)):
-            if tag in offline:
-                for track in offline[tag]["state"][:8]:
-                    axis.plot(*_line(track), color=colour, lw=0.5, alpha=0.6)
-        _wall(axis, extent)
-        axis.set_title(title)
-        figure.colorbar(image, ax=axis, shrink=0.7, pad=0.02)
-    figure.savefig(folder / "heatmaps.png")
-    plt.close(figure)
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(1, len(fields), figsize=(3.2 * len(fields), 3.0), squeeze=False)
+        for axis, (title, field) in zip(axes[0], fields.items(), strict=True):
+            picture = field.values.reshape(grid.shape[:2]).cpu().numpy()
+            low, high = field.limits or (picture.min(), picture.max())
+            image = axis.imshow(
+                picture, extent=extent, cmap=field.colours, vmin=low, vmax=high, interpolation="nearest"
+            )
+            if field.level is not None and picture.min() < field.level < picture.max():
+                x, y = grid.unbind(-1)
+                axis.contour(x.numpy(), y.numpy(), picture, levels=[field.level], colors=INK, linewidths=0.8)
+            for tag, colour in ((Tag.SUCCESS, SAFE), (Tag.CONSTRAINT, UNSAFE)):
+                if tag in offline:
+                    for track in offline[tag]["state"][:8]:
+                        axis.plot(*_line(track), color=colour, lw=0.5, alpha=0.6)
+            _wall(axis, extent)
+            axis.set_title(title)
+            figure.colorbar(image, ax=axis, shrink=0.7, pad=0.02)
+        figure.savefig(folder / "heatmaps.png")
+        plt.close(figure)
+
+
+def agent_fields(env: ls3_envs.VisualConstraintEnv, agent: LS3Agent, planner: LS3Planner) -> dict[str, Field]:
+    """Value, spread of the values, safe set, constraint and goal."""
+    latent = over_plane(env, lambda pixels: _encode(agent, pixels))["latent"]
+    values = agent.value(TensorDict({"latent": latent}, [len(latent)]))["state_value"].squeeze(-1)
+    heads = ((agent.safe_set, planner.safe_set_threshold), (agent.constraint, planner.constraint_threshold))
+    (safe, s_level), (unsafe, c_level) = ((head.probability(latent), level) for head, level in heads)
+    return {
+        "Value V": Field(values.mean(-1), "viridis"),
+        "Spread of V over members": Field(values.std(-1), "magma"),
+        "Safe set $f_S$": Field(safe, "BuGn", (0.0, 1.0), s_level),
+        "Constraint $f_C$": Field(unsafe, "OrRd", (0.0, 1.0), c_level),
+        "Goal $f_G$": Field(agent.goal.probability(latent), "Blues", (0.0, 1.0), 0.5),
+    }
 
 
 def paths(
@@ -273,7 +294,7 @@ def plans(
     figure, axes = plt.subplots(1, moments, figsize=(3.3 * moments, 3.0))
     for axis, t in zip(axes, np.linspace(0, 0.45 * len(episode), moments).astype(int), strict=True):
         state = episode["state"][t]
-        latent = _encode_states(env, agent, state[None])
+        latent = _encode(agent, env.render_states(state[None]))["latent"]
         draws = torch.rand(1, candidates, horizon, space.low.shape[-1], device=latent.device)
         actions = space.low + (space.high - space.low) * draws
         verdict = planner.judge(
@@ -318,7 +339,7 @@ def timelines(
         strip = torch.cat([image[-3:] for image in pixels[chosen].cpu()], -1)
         column[0].imshow(strip.permute(1, 2, 0).numpy(), aspect="auto", extent=(0, len(pixels), 0, 1))
         column[0].set(title=title, xticks=[], yticks=[])
-        latent = agent.encoder(TensorDict({"pixels": pixels.to(_device(agent))}, [len(pixels)]))["latent"]
+        latent = _encode(agent, pixels)["latent"]
         values = agent.value(TensorDict({"latent": latent}, [len(latent)]))["state_value"].squeeze(-1).cpu()
         time = np.arange(1, len(pixels) + 1)
         middle, spread = values.mean(-1).numpy(), values.std(-1).numpy()

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from common import progress
-from ls3_torchrl import LS3Agent
 from learning import threads
+from ls3_torchrl import LS3Agent
 
 
 class StateProbe:

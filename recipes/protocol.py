@@ -90,7 +90,7 @@ class Algorithm(ABC):
     def restore(self, path: Path) -> None:
         """Take the networks of a file."""
 
-    def draw(
+    def draw(  # noqa: B027
         self,
         folder: Path,
         offline: dict[Tag, TensorDictBase],

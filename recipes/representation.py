@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
@@ -52,8 +53,20 @@ def encode(agent: LS3Agent, buffer: TaggedReplayBuffer) -> None:
         buffer.encode(agent.encoder, progress=lambda done, _: bar.update(done - bar.n))
 
 
+def take_vae(agent: LS3Agent, buffer: TaggedReplayBuffer, path: str | Path) -> None:
+    """Take encoder and decoder of a trained agent, frozen, and encode every frame."""
+    shape = agent.architecture
+    trained = LS3Agent.load(
+        path, in_channels=shape.in_channels, latent_dim=shape.latent_dim, background=shape.background
+    )
+    for half, other in ((agent.encoder, trained.encoder), (agent.decoder, trained.decoder)):
+        half.load_state_dict(other.state_dict())
+        half.requires_grad_(False)
+    encode(agent, buffer)
+
+
 def train_vae(agent: LS3Agent, buffer: TaggedReplayBuffer, config: DictConfig, run: RunFolder) -> None:
-    """Train encoder and decoder on all frames, freeze them, and encode every frame.
+    """Train encoder and decoder on all frames, freeze them, and encode every frame; or take them from ``vae.agent``.
 
     Args:
         agent: its encoder and decoder are trained, and its dynamics with them where ``vae.prediction_weight`` asks.
@@ -62,6 +75,9 @@ def train_vae(agent: LS3Agent, buffer: TaggedReplayBuffer, config: DictConfig, r
         run: where metrics go.
     """
     options = config.vae
+    if options.agent is not None:
+        take_vae(agent, buffer, options.agent)
+        return
     for half in (agent.encoder, agent.decoder):
         half.to(memory_format=torch.channels_last)
     if agent.decoder.background is not None:

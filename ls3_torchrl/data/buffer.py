@@ -38,6 +38,7 @@ class TaggedReplayBuffer:
             (:func:`~ls3_torchrl.data.failure_tail`), instead of ending with the horizon.
         success_tail: steps kept of the successes that an episode ends with; ``None`` keeps all. Once the task is done
             nothing happens, and such steps can be most of the data.
+        extra_keys: entries of the episodes, beside the standard ones, that are kept with their transitions.
         pixel_capacity: frames kept; ``None`` makes room for the same episodes, frames at both ends included.
         scratch_dir: memory-map both stores below this folder instead of holding them in memory.
         device: where sampled batches live.
@@ -72,6 +73,7 @@ class TaggedReplayBuffer:
         gamma: float = 0.99,
         continue_failures: bool = False,
         success_tail: int | None = None,
+        extra_keys: Iterable[NestedKey] = (),
         pixel_capacity: int | None = None,
         scratch_dir: str | Path | None = None,
         device: torch.device | str = "cpu",
@@ -85,6 +87,7 @@ class TaggedReplayBuffer:
         self.continue_failures = continue_failures
         self.success_tail = None if success_tail is None else require_at_least(success_tail, 1, "success_tail")
         self.device = torch.device(device)
+        self.extra_keys = tuple(extra_keys)
         folder = None if scratch_dir is None else Path(scratch_dir)
 
         def storage(size: int, name: str) -> Storage:
@@ -111,7 +114,7 @@ class TaggedReplayBuffer:
         """
         tag = Tag.parse(tag)
         needed = ("pixels", "action", *(("next", k) for k in ("pixels", "reward", "constraint", "success")))
-        require_keys(episodes, needed, "TaggedReplayBuffer.add")
+        require_keys(episodes, (*needed, *self.extra_keys), "TaggedReplayBuffer.add")
         if episodes.ndim not in (1, 2):
             raise ValueError(f"Episodes must have batch size [T] or [N, T], got {list(episodes.shape)}.")
         for episode in episodes.unbind(0) if episodes.ndim == 2 else [episodes]:
@@ -154,6 +157,7 @@ class TaggedReplayBuffer:
             },
             [steps],
         )
+        rows.update(episode.select(*self.extra_keys))
         if self._encoder is None:
             blank = torch.zeros(steps + 1, self.latent_dim)
             posteriors = TensorDict({"loc": blank, "scale": blank}, [steps + 1])
@@ -246,6 +250,7 @@ class TaggedReplayBuffer:
         members: int | None = None,
         without: NestedKey | None = None,
         steps: int | None = None,
+        pixels: bool = False,
     ) -> TensorDictBase:
         """Transitions with freshly drawn latents, uniformly from the union of the tags.
 
@@ -255,15 +260,20 @@ class TaggedReplayBuffer:
             members: M for a bootstrap: B transitions drawn independently for each of M members.
             without: label whose rows are left out, such as ``"frozen"``.
             steps: K for stretches of K transitions of one episode, in their order.
+            pixels: add ``pixels`` and ``("next", "pixels")``; then no encoder is needed, and latents are zero without.
 
         Returns:
             ``[B]``, or ``[B, M]``, or either with K behind, with ``latent`` and ``("next", "latent")`` drawn from the
             posteriors.
         """
-        if self._encoder is None:
+        if self._encoder is None and not pixels:
             raise RuntimeError("The buffer has no latents yet: call buffer.encode(encoder) after training the VAE.")
         count = batch_size * (members or 1)
-        rows = self._stretches(count, tags, without, steps or 1)[1].to(self.device)
+        rows = self._stretches(count, tags, without, steps or 1)[1]
+        if pixels:
+            for group, slot in zip((rows, rows.get("next")), self._slots(rows["frame"]), strict=True):
+                group.set("pixels", self.pixels.storage[slot]["pixels"])
+        rows = rows.to(self.device)
         for group in (rows, rows.get("next")):
             loc = group.get("loc")
             group.set("latent", torch.addcmul(loc, group.get("scale"), torch.randn_like(loc)))

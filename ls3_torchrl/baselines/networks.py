@@ -1,0 +1,164 @@
+"""Actors and critics of the comparisons, made of TorchRL's parts (section 1.1.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.data import Bounded
+from torchrl.modules import MLP, ConvNet, ProbabilisticActor, TanhModule, TanhNormal, ValueOperator
+
+from ls3_torchrl._checks import require_at_least
+
+
+def action_bounds(action_spec: Bounded) -> tuple[Tensor, Tensor]:
+    """Lowest and highest action ``[A]``; of a batched spec, those of its first row."""
+    space = action_spec.space
+    low, high = (bound.reshape(-1, action_spec.shape[-1])[0] for bound in (space.low, space.high))
+    if not (torch.isfinite(low) & torch.isfinite(high) & (low < high)).all():
+        raise ValueError(f"Actions need finite bounds, low below high; got {low.tolist()} and {high.tolist()}.")
+    return low, high
+
+
+class PixelFeatures(nn.Module):
+    """Features of images, learnt with the network that reads them: three convolutions, flattened.
+
+    Args:
+        in_channels: C, 3 x stacked frames.
+
+    Example:
+        >>> PixelFeatures(3)(torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).shape
+        torch.Size([2, 1024])
+    """
+
+    #: Of images of 64 x 64.
+    size = 1024
+
+    def __init__(self, in_channels: int = 3) -> None:
+        super().__init__()
+        self.convolutions = ConvNet(
+            in_features=require_at_least(in_channels, 1, "in_channels"),
+            num_cells=[32, 64, 64],
+            kernel_sizes=[8, 4, 3],
+            strides=[4, 2, 1],
+            activation_class=nn.ReLU,
+        )
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Features ``[*B, 1024]`` of uint8 images ``[*B, C, 64, 64]``."""
+        return self.convolutions(pixels.float() / 255.0)
+
+
+class _Critic(nn.Module):
+    """A network of what is observed and the action, which it sees in units of half its range."""
+
+    middle: Tensor
+    reach: Tensor
+
+    def __init__(
+        self, low: Tensor, high: Tensor, features: nn.Module | None, in_features: int, hidden: Sequence[int]
+    ) -> None:
+        super().__init__()
+        self.features = nn.Identity() if features is None else features
+        self.network = MLP(in_features + len(low), 1, num_cells=list(hidden), activation_class=nn.ReLU)
+        self.register_buffer("middle", (high + low) / 2, persistent=False)
+        self.register_buffer("reach", (high - low) / 2, persistent=False)
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        return self.network(torch.cat([self.features(observation), (action - self.middle) / self.reach], -1))
+
+
+def _actor_network(
+    in_features: int, out_features: int, features: nn.Module | None, hidden: Sequence[int]
+) -> nn.Sequential:
+    mlp = MLP(in_features, out_features, num_cells=list(hidden), activation_class=nn.ReLU)
+    return nn.Sequential(nn.Identity() if features is None else features, mlp)
+
+
+def gaussian_actor(
+    action_spec: Bounded,
+    in_features: int,
+    *,
+    observation_key: NestedKey = "loc",
+    features: nn.Module | None = None,
+    hidden: Sequence[int] = (256, 256),
+    initial_std: float = 1.0,
+) -> ProbabilisticActor:
+    """π(a | s), a Gaussian squashed into the actions' box; deterministic sampling takes its middle.
+
+    Args:
+        action_spec: of one action ``[A]``, or batched.
+        in_features: size of what is observed, or of ``features``.
+        observation_key: what is read: latents, or images with ``features``.
+        features: reads what is observed first, such as :class:`PixelFeatures`.
+        hidden: sizes of the hidden layers.
+        initial_std: standard deviation before squashing of an untrained actor, about.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> actor = gaussian_actor(Bounded(low=-3.0, high=3.0, shape=(2,)), 8)
+        >>> td = actor(TensorDict({"loc": torch.zeros(4, 8)}, [4]))
+        >>> td["action"].shape, td["action_log_prob"].shape
+        (torch.Size([4, 2]), torch.Size([4]))
+    """
+    low, high = action_bounds(action_spec)
+    network = nn.Sequential(
+        _actor_network(in_features, 2 * len(low), features, hidden),
+        NormalParamExtractor(scale_mapping=f"biased_softplus_{initial_std}"),
+    )
+    return ProbabilisticActor(
+        TensorDictModule(network, [observation_key], ["action_loc", "action_scale"]),
+        in_keys={"loc": "action_loc", "scale": "action_scale"},
+        spec=Bounded(low=low, high=high, shape=low.shape),
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": low, "high": high},
+        return_log_prob=True,
+    )
+
+
+def deterministic_actor(
+    action_spec: Bounded,
+    in_features: int,
+    *,
+    observation_key: NestedKey = "loc",
+    features: nn.Module | None = None,
+    hidden: Sequence[int] = (256, 256),
+) -> TensorDictSequential:
+    """μ(s) in the actions' box. Arguments as for :func:`gaussian_actor`.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> actor = deterministic_actor(Bounded(low=-3.0, high=3.0, shape=(2,)), 8)
+        >>> actor(TensorDict({"loc": torch.zeros(4, 8)}, [4]))["action"].shape
+        torch.Size([4, 2])
+    """
+    low, high = action_bounds(action_spec)
+    network = _actor_network(in_features, len(low), features, hidden)
+    return TensorDictSequential(
+        TensorDictModule(network, [observation_key], ["action"]),
+        TanhModule(in_keys=["action"], spec=Bounded(low=low, high=high, shape=low.shape)),
+    )
+
+
+def action_value(
+    action_spec: Bounded,
+    in_features: int,
+    *,
+    observation_key: NestedKey = "loc",
+    features: nn.Module | None = None,
+    hidden: Sequence[int] = (256, 256),
+) -> ValueOperator:
+    """Q(s, a), written as ``state_action_value``. Arguments as for :func:`gaussian_actor`.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> critic = action_value(Bounded(low=-3.0, high=3.0, shape=(2,)), 8)
+        >>> td = TensorDict({"loc": torch.zeros(4, 8), "action": torch.zeros(4, 2)}, [4])
+        >>> critic(td)["state_action_value"].shape
+        torch.Size([4, 1])
+    """
+    low, high = action_bounds(action_spec)
+    return ValueOperator(_Critic(low, high, features, in_features, hidden), in_keys=[observation_key, "action"])

@@ -1,0 +1,18 @@
+"""Behaviour cloning end to end."""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+
+from comparisons import train
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="bc")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    train(config)
+
+
+if __name__ == "__main__":
+    main()
