@@ -15,8 +15,10 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.data import Bounded
 
+import protocol
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, load_episodes, save_episodes
+from settings import agent_options
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 PRESETS = ("cpu", "paper", "smoke")
@@ -44,8 +46,9 @@ def no_work(ls3, monkeypatch):
     def work(*args, **kwargs):
         pytest.fail("the recipe began to work")
 
-    monkeypatch.setattr(ls3, "collect_demonstrations", work)
+    monkeypatch.setattr(protocol, "collect_demonstrations", work)
     monkeypatch.setattr(ls3, "Training", work)
+    monkeypatch.setattr(ls3, "train_vae", work)
 
 
 # --- configuration --------------------------------------------------------------------------------------------
@@ -115,8 +118,9 @@ def test_every_preset_composes_and_fits_the_library(preset):
     assert config.preset == preset
     assert OmegaConf.missing_keys(config) == set()
     # Agent and planner take exactly these settings, and find them in range.
-    agent = LS3Agent(action_dim=2, **config.agent)
-    planner = agent.planner(Bounded(low=-3.0, high=3.0, shape=(2,)), **config.planner)
+    spec = Bounded(low=-3.0, high=3.0, shape=(2,))
+    agent = LS3Agent(action_dim=2, **agent_options(config, spec))
+    planner = agent.planner(spec, **config.planner)
     assert planner.horizon == config.planner.horizon
     assert planner.cem.num_candidates == config.planner.num_candidates
 
@@ -233,8 +237,8 @@ def test_help_names_groups_settings_and_examples(tmp_path):
 # --- parts ----------------------------------------------------------------------------------------------------
 
 
-def test_parts_of_a_run_share_no_seed(ls3):
-    drawn = [seed for run in range(50) for seed in ls3.seeds(run).values()]
+def test_parts_of_a_run_share_no_seed():
+    drawn = [seed for run in range(50) for seed in protocol.seeds(run).values()]
     assert len(set(drawn)) == len(drawn)
 
 
@@ -304,7 +308,7 @@ def test_the_smoke_preset_runs_everything_and_leaves_a_complete_folder(ls3, tmp_
     # A checkpoint from before the first online episode, and one after each update; the last is the agent.
     checkpoints = sorted(path.name for path in (folder / "checkpoints").iterdir())
     assert checkpoints == ["agent_000.pt", "agent_001.pt", "agent_002.pt"]
-    agents = [LS3Agent.load(folder / "checkpoints" / name, **config.agent) for name in checkpoints]
+    agents = [LS3Agent.load(folder / "checkpoints" / name, latent_dim=config.agent.latent_dim) for name in checkpoints]
     final = LS3Agent.load(folder / summary["agent"])
     for name, weights in final.state_dict().items():
         assert torch.equal(weights, agents[-1].state_dict()[name]), name
@@ -333,19 +337,19 @@ def test_the_seed_decides_a_run(ls3, tmp_path):
     assert not all(torch.equal(one[2][name], other[2][name]) for name in one[2])
 
 
-def test_the_best_update_violates_least_then_returns_most_and_is_the_latest_of_equals(ls3):
+def test_the_best_update_violates_least_then_returns_most_and_is_the_latest_of_equals():
     def figures(violation, *returns):
         return {"violation": torch.tensor(violation).bool(), "return": torch.tensor(returns)}
 
     rounds = [figures([0, 1], -9.0, -9.0), figures([0, 0], -40.0, -50.0), figures([0, 0], -44.0, -46.0)]
-    assert ls3.best_update(rounds) == 2
-    assert ls3.best_update(rounds[:2]) == 1
-    assert ls3.best_update(rounds[:1]) == 0
+    assert protocol.best_update(rounds) == 2
+    assert protocol.best_update(rounds[:2]) == 1
+    assert protocol.best_update(rounds[:1]) == 0
 
 
 @pytest.mark.parametrize("select", ["last", "best"])
 def test_the_agent_that_is_kept_is_the_one_that_was_selected(ls3, monkeypatch, tmp_path, select):
-    monkeypatch.setattr(ls3, "best_update", lambda online: 1)
+    monkeypatch.setattr(protocol, "best_update", lambda online: 1)
     ls3.train(configure("preset=smoke", f"online.select={select}", "pictures=false", f"output={tmp_path / 'run'}"))
     kept = LS3Agent.load(tmp_path / "run" / "agent.pt").state_dict()
     agents = [LS3Agent.load(path).state_dict() for path in sorted((tmp_path / "run" / "checkpoints").glob("*.pt"))]

@@ -5,13 +5,17 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from tensordict import TensorDict
+from torchrl.data import Bounded
 from torchrl.objectives import HardUpdate
 
+from learning import Learner, Term, cooled_down
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.modules import ValueEnsemble
 from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, TD1ValueLoss, VAELoss
-from training import Learner, Term, Training, cooled_down
+from representation import enlarge, train_vae
+from settings import agent_options
+from training import Training
 
 
 class Silent:
@@ -29,6 +33,10 @@ def config(request):
     conf = request.config.rootpath / "recipes" / "conf"
     with initialize_config_dir(str(conf), version_base="1.3"):
         return compose("ls3", ["preset=smoke"])
+
+
+def make_agent(config):
+    return LS3Agent(**agent_options(config, Bounded(low=-3.0, high=3.0, shape=(2,))), action_dim=2)
 
 
 def test_td1_starts_from_what_reward_to_go_had_learnt():
@@ -57,7 +65,7 @@ def test_a_loss_that_is_not_finite_stops_the_phase_with_a_remedy():
 
 
 def test_each_learner_draws_from_the_data_that_the_paper_names(config):
-    agent = LS3Agent(action_dim=2, **config.agent)
+    agent = make_agent(config)
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
     drawn = {}
 
@@ -87,7 +95,7 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(config):
 def test_what_follows_a_violation_teaches_the_dynamics_as_the_setting_says(config, frozen):
     OmegaConf.update(config, "loss.frozen_dynamics", frozen)
     OmegaConf.update(config, "vae.prediction_weight", 1.0)
-    agent = LS3Agent(action_dim=2, **config.agent)
+    agent = make_agent(config)
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
     step = {"reward": -torch.ones(9, 1), "pixels": torch.zeros(9, 3, 64, 64, dtype=torch.uint8)}
     step |= {k: torch.zeros(9, 1, dtype=torch.bool) for k in ("constraint", "success")}
@@ -98,7 +106,7 @@ def test_what_follows_a_violation_teaches_the_dynamics_as_the_setting_says(confi
     draw = buffer.sample_pixel_transitions
     buffer.sample_pixel_transitions = lambda *a, **o: drawn.append(draw(*a, **o)) or drawn[-1]
     training = Training(agent, buffer, config, Silent())
-    training.train_vae()
+    train_vae(agent, buffer, config, Silent())
     latent = {int(step) for step in training.dynamics.sample()["action"].flatten().tolist()}
     pixels = {int(step) for batch in drawn for step in batch["action"].flatten().tolist()}
     for steps in (latent, pixels):
@@ -110,19 +118,19 @@ def test_what_follows_a_violation_teaches_the_dynamics_as_the_setting_says(confi
 @pytest.mark.parametrize("background", [True, False])
 def test_a_decoder_with_a_background_starts_from_the_mean_image(config, background):
     OmegaConf.update(config, "agent.background", background)
-    agent = LS3Agent(action_dim=2, **config.agent)
+    agent = make_agent(config)
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
     step = {"reward": -torch.ones(9, 1), "pixels": torch.full((9, 3, 64, 64), 51, dtype=torch.uint8)}
     step |= {k: torch.zeros(9, 1, dtype=torch.bool) for k in ("constraint", "success")}
     buffer.add(TensorDict({"pixels": step["pixels"], "action": torch.zeros(9, 2), "next": step}, [9]), "success")
     run = Silent()
-    Training(agent, buffer, config, run).train_vae()
+    train_vae(agent, buffer, config, run)
     first = run.rows[0][2]["reconstruction"]
     assert (first < 0.01) == background  # black is 0.2² = 0.04 away
 
 
 def test_undecided_episodes_count_as_the_setting_says_online_alone(config):
-    agent = LS3Agent(action_dim=2, **config.agent)
+    agent = make_agent(config)
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
 
     def episode(**ends):
@@ -172,7 +180,7 @@ def test_a_term_beside_the_loss_pulls_the_same_network_with_its_weight():
 def test_failures_are_violating_demonstrations_at_the_value_of_failure(config):
     OmegaConf.update(config, "loss.failure_weight", 0.5)
     OmegaConf.update(config, "loss.failure_value", -42.0)
-    agent = LS3Agent(action_dim=2, **config.agent)
+    agent = make_agent(config)
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
     step = {"reward": -torch.ones(9, 1), "pixels": torch.zeros(9, 3, 64, 64, dtype=torch.uint8)}
     step |= {k: torch.zeros(9, 1, dtype=torch.bool) for k in ("constraint", "success")}
@@ -192,7 +200,7 @@ def test_failures_are_violating_demonstrations_at_the_value_of_failure(config):
 def test_failures_may_be_the_violating_states_alone_and_have_the_value_of_an_episode_without_success(config):
     OmegaConf.update(config, "loss.failure_weight", 0.5)
     OmegaConf.update(config, "loss.failure_rows", "violating")
-    agent = LS3Agent(action_dim=2, **config.agent)
+    agent = make_agent(config)
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
     step = {"reward": -torch.ones(9, 1), "pixels": torch.randint(256, (9, 3, 64, 64), dtype=torch.uint8)}
     step |= {"success": torch.zeros(9, 1, dtype=torch.bool), "constraint": torch.arange(9)[:, None] >= 7}
@@ -207,22 +215,19 @@ def test_failures_may_be_the_violating_states_alone_and_have_the_value_of_an_epi
 
 
 def test_batches_seem_drawn_from_the_enlarged_dataset(config):
-    agent = LS3Agent(action_dim=2, **config.agent)
+    agent = make_agent(config)
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
     buffer.add(noisy_episode(), "success")
     pixels = torch.randint(256, (400, 3, 64, 64), dtype=torch.uint8)
-    training = Training(agent, buffer, config, Silent())
-    assert torch.equal(training._enlarge(pixels), pixels)
-    OmegaConf.update(config, "vae.enlarge_to", 4 * len(buffer.pixels))
-    same = (training._enlarge(pixels) == pixels).flatten(1).all(1).float().mean()
+    assert torch.equal(enlarge(pixels, buffer, None), pixels)
+    same = (enlarge(pixels, buffer, 4 * len(buffer.pixels)) == pixels).flatten(1).all(1).float().mean()
     assert abs(same - 0.25) < 0.08
-    OmegaConf.update(config, "vae.enlarge_to", len(buffer.pixels))
-    assert torch.equal(training._enlarge(pixels), pixels)
+    assert torch.equal(enlarge(pixels, buffer, len(buffer.pixels)), pixels)
 
 
 def test_mean_latents_feed_posterior_means_to_the_models_that_are_named(config):
     OmegaConf.update(config, "loss.mean_latents", ["dynamics", "goal"])
-    agent = LS3Agent(action_dim=2, **config.agent)
+    agent = make_agent(config)
     training = Training(agent, TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim), config, Silent())
     assert training.dynamics.loss.tensor_keys.latent == "loc"
     assert training.dynamics.loss.tensor_keys.next_latent == ("next", "loc")
@@ -246,10 +251,10 @@ def test_unit_scale_measures_latents_in_their_spread_and_keeps_the_pictures(conf
     for unit_scale in (False, True):
         OmegaConf.update(config, "vae", {"steps": 3, "batch_size": 4, "crop_scale": None, "unit_scale": unit_scale})
         torch.manual_seed(1)
-        agent = LS3Agent(action_dim=2, **config.agent)
+        agent = make_agent(config)
         buffer = TaggedReplayBuffer(20, latent_dim=config.agent.latent_dim)
         buffer.add(episode, "success")
-        Training(agent, buffer, config, Silent()).train_vae()
+        train_vae(agent, buffer, config, Silent())
         spreads.append(buffer.latents.storage[:]["loc"].std(0).square().mean().sqrt().item())
         pictures.append(agent.decoder(agent.encoder(episode.select("pixels")))["reco_pixels"])
     assert spreads[1] == pytest.approx(1.0, rel=1e-3)
@@ -264,12 +269,12 @@ def test_the_prediction_term_trains_the_dynamics_beside_the_vae_by_its_weight(co
     for weight in (0.0, 1.0, 1.0, 2.0):
         torch.manual_seed(1)
         OmegaConf.update(config, "vae", {"steps": 20, "lr": 1e-3, "prediction_weight": weight})
-        agent = LS3Agent(action_dim=2, **config.agent)
+        agent = make_agent(config)
         before = [p.detach().clone() for p in agent.dynamics.parameters()]
         buffer = TaggedReplayBuffer(20, latent_dim=config.agent.latent_dim)
         buffer.add(episode, "success")
         run = Silent()
-        Training(agent, buffer, config, run).train_vae()
+        train_vae(agent, buffer, config, run)
         changed = [not torch.equal(a, b) for a, b in zip(before, agent.dynamics.parameters(), strict=True)]
         assert any(changed) == (weight > 0.0)
         assert ("prediction" in run.rows[-1][2]) == (weight > 0.0)
@@ -286,20 +291,20 @@ def test_the_prediction_term_trains_the_dynamics_beside_the_vae_by_its_weight(co
 )
 def test_beta_rises_over_its_share_of_the_steps(config, monkeypatch, warmup, shares):
     OmegaConf.update(config, "vae", {"steps": 4, "batch_size": 2, "beta": 0.3, "warmup": warmup})
-    agent = LS3Agent(action_dim=2, **config.agent)
+    agent = make_agent(config)
     buffer = TaggedReplayBuffer(20, latent_dim=config.agent.latent_dim)
     step = {"reward": -torch.ones(3, 1), "pixels": torch.zeros(3, 3, 64, 64, dtype=torch.uint8)}
     step |= {k: torch.zeros(3, 1, dtype=torch.bool) for k in ("constraint", "success")}
     buffer.add(TensorDict({"pixels": step["pixels"], "action": torch.zeros(3, 2), "next": step}, [3]), "success")
     seen, forward = [], VAELoss.forward
     monkeypatch.setattr(VAELoss, "forward", lambda self, td: (seen.append(self.beta), forward(self, td))[1])
-    Training(agent, buffer, config, Silent()).train_vae()
+    train_vae(agent, buffer, config, Silent())
     assert seen == pytest.approx([0.3 * share for share in shares])
 
 
 @pytest.mark.parametrize(("error", "warned"), [(0.9, True), (0.3, False)])
 def test_a_vae_that_draws_the_mean_image_is_noticed(config, capsys, error, warned):
-    agent = LS3Agent(action_dim=2, **config.agent)
+    agent = make_agent(config)
     buffer = TaggedReplayBuffer(20, latent_dim=config.agent.latent_dim)
     pixels = (torch.arange(20) % 2 * 255).to(torch.uint8)[:, None, None, None].expand(-1, 3, 64, 64).contiguous()
     step = {"reward": -torch.ones(19, 1), "pixels": pixels[1:]}
