@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -102,7 +103,9 @@ class Comparison(Algorithm):
         self.buffer, self.run = buffer, run
         self.bonus = 0.0
         self.steps_per_update = round(self.options.updates_per_step * horizon * self.config.online.episodes_per_update)
-        cloning = BCLoss(self.networks["actor"], loss_function=self._distance)
+        with warnings.catch_warnings():  # TorchRL's own class lacks an annotation that TorchRL looks for
+            warnings.filterwarnings("ignore", "The name target_actor_network_params wasn't part of the annotations")
+            cloning = BCLoss(self.networks["actor"], loss_function=self._distance)
         self.cloning = Learner("bc", cloning, self.rows(DEMONSTRATIONS), lr=self.options.lr)
 
     def _distance(self, predicted: Tensor, expert: Tensor) -> Tensor:
