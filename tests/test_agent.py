@@ -72,7 +72,7 @@ def test_propagation_travels_with_the_file(tmp_path):
 
 
 def test_the_form_of_the_dynamics_travels_with_the_file(tmp_path):
-    agent = LS3Agent(action_dim=2, latent_dim=4, control_affine=True)
+    agent = LS3Agent(action_dim=2, latent_dim=4, control_affine=True, action_scale=[0.5, 0.02])
     loaded = LS3Agent.load(agent.save(tmp_path / "agent.pt"))
     latent, action = torch.randn(3, 4), torch.randn(3, 2)
     for one, other in zip(

@@ -3,7 +3,7 @@
 from ls3_torchrl.data.augment import random_perspective, random_resized_crop
 from ls3_torchrl.data.buffer import TaggedReplayBuffer
 from ls3_torchrl.data.dataset import check_episodes, load_episodes, save_episodes
-from ls3_torchrl.data.labels import failure_tail, frozen, in_success, reward_to_go, undecided
+from ls3_torchrl.data.labels import failure_tail, frozen, in_success, reward_to_go, undecided, without_idle_end
 from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.tags import ALL_TAGS, VALUE_TAGS, Tag
 
@@ -23,4 +23,5 @@ __all__ = [
     "reward_to_go",
     "save_episodes",
     "undecided",
+    "without_idle_end",
 ]

@@ -77,9 +77,7 @@ def test_the_critic_sees_actions_in_units_of_half_the_box():
 
 @pytest.mark.parametrize("make", [gaussian_actor, deterministic_actor, action_value])
 def test_networks_read_images_through_features_of_their_own(make):
-    network = make(
-        box(), PixelFeatures.size, observation_key="pixels", features=PixelFeatures(6), hidden=(8,)
-    )
+    network = make(box(), PixelFeatures.size, observation_key="pixels", features=PixelFeatures(6), hidden=(8,))
     pixels = torch.randint(256, (3, 6, 64, 64), dtype=torch.uint8)
     td = network(TensorDict({"pixels": pixels, "action": torch.zeros(3, 2)}, [3]))
     out = td["state_action_value" if make is action_value else "action"]

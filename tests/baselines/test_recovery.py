@@ -148,9 +148,7 @@ def test_the_ends_of_the_threshold(threshold, recovers):
 
 def test_any_policy_can_be_wrapped_and_keeps_its_keys():
     encoder = nn.Linear(4, 1)
-    task = TensorDictSequential(
-        TensorDictModule(encoder, ["sensors"], ["loc"]), gaussian_actor(SPEC, 1, hidden=(4,))
-    )
+    task = TensorDictSequential(TensorDictModule(encoder, ["sensors"], ["loc"]), gaussian_actor(SPEC, 1, hidden=(4,)))
     policy = RecoveryPolicy(task, deterministic_actor(SPEC, 1, hidden=(4,)), SafetyCritic(SPEC, 1, hidden=(4,)), 0.5)
     assert policy.in_keys == ["sensors"]
     assert set(policy.out_keys) == {*task.out_keys, "task_action", "risk", "recovered"}

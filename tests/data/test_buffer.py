@@ -87,6 +87,60 @@ def test_labels_and_tags_are_right_by_hand(scratch):
     assert scratch is None or any((scratch / "pixels").iterdir())
 
 
+def test_a_success_tail_keeps_the_labels_and_leaves_the_idle_end_out(scratch):
+    film = Film()
+    kept, whole = (
+        TaggedReplayBuffer(20, latent_dim=D, gamma=0.5, scratch_dir=scratch and scratch / name, success_tail=tail)
+        for name, tail in (("kept", 2), ("whole", None))
+    )
+    episode = film.shoot(8, success=[3, 4, 5, 6, 7])
+    for buffer in (kept, whole):
+        buffer.add(episode, "success")
+        buffer.add(film.shoot(2), "constraint")
+    assert (len(kept), len(whole)) == (5 + 2, 8 + 2)
+    for key in ("reward_to_go", "in_success", "undecided", "frozen", "action", ("next", "success")):
+        assert torch.equal(kept.latents.storage[:][key][:5], whole.latents.storage[:][key][:5]), key
+    # Stretches end with what was kept, and every row finds its own frames.
+    assert kept.latents.storage[:]["steps_left"].flatten().tolist() == [5, 4, 3, 2, 1, 2, 1]
+    kept.encode(reading_encoder())
+    rows = kept.latents.storage[:5]
+    torch.testing.assert_close(rows["next", "loc"][:, 0] - rows["loc"][:, 0], torch.ones(5), atol=1e-2, rtol=0)
+    with pytest.raises(ValueError, match="success_tail must be at least 1"):
+        TaggedReplayBuffer(20, success_tail=0)
+
+
+def test_extra_keys_are_kept_and_asked_for():
+    film = Film()
+    buffer = TaggedReplayBuffer(20, latent_dim=D, extra_keys=["wish", ("next", "cost")])
+    episode = film.shoot(3)
+    with pytest.raises(KeyError, match="wish"):
+        buffer.add(episode, "success")
+    episode["wish"], episode["next", "cost"] = 2 * episode["action"], episode["action"][:, :1] + 1
+    buffer.add(episode, "success")
+    buffer.encode(reading_encoder())
+    rows = buffer.sample(30)
+    assert torch.equal(rows["wish"], 2 * rows["action"])
+    assert torch.equal(rows["next", "cost"], rows["action"][:, :1] + 1)
+
+
+@pytest.mark.parametrize("encoded", [True, False])
+def test_pixels_come_with_their_rows_and_need_no_encoder(scratch, encoded):
+    film = Film()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, pixel_capacity=13, scratch_dir=scratch)
+    for _ in range(5):  # overwrites
+        buffer.add(film.shoot(4), "online")
+    if encoded:
+        buffer.encode(reading_encoder())
+    else:
+        with pytest.raises(RuntimeError, match="no latents yet"):
+            buffer.sample(4)
+    rows = buffer.sample(40, pixels=True, members=2)
+    assert rows["pixels"].shape == (40, 2, 3, 64, 64)
+    assert torch.equal(rows["pixels"][..., 0, 0, 0].float(), rows["action"][..., 0])
+    assert torch.equal(rows["next", "pixels"][..., 0, 0, 0].float(), rows["action"][..., 0] + 1)
+    assert (rows["loc"][..., 0] > 0).any() == encoded
+
+
 def test_frames_match_rows_when_encoded_at_the_end(scratch):
     film = Film()
     buffer = TaggedReplayBuffer(20, latent_dim=D, scratch_dir=scratch)

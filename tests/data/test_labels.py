@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ls3_torchrl.data import failure_tail, frozen, in_success, reward_to_go, undecided
+from ls3_torchrl.data import failure_tail, frozen, in_success, reward_to_go, undecided, without_idle_end
 
 
 def test_reward_to_go_by_hand():
@@ -100,3 +100,18 @@ def test_frozen_are_the_steps_after_the_first_violation_row_by_row():
     constraint[0, 2:] = True
     constraint[1, 1] = True  # even where the flag does not stay
     assert frozen(constraint).squeeze(-1).int().tolist() == [[0, 0, 0, 1, 1], [0, 0, 1, 1, 1], [0] * 5]
+
+
+@pytest.mark.parametrize(
+    ("success", "tail", "left"),
+    [
+        ([0, 0, 0], 1, 3),  # never done: nothing to leave out
+        ([0, 1, 1, 1], 1, 2),
+        ([0, 1, 1, 1], 2, 3),
+        ([0, 1, 1, 1], 9, 4),
+        ([1, 1, 0, 1], 1, 4),  # an earlier success that did not last stays whole
+        ([1, 1], 1, 1),
+    ],
+)
+def test_the_idle_end_by_hand(success, tail, left):
+    assert without_idle_end(torch.tensor(success).bool().unsqueeze(-1), tail) == left

@@ -45,3 +45,22 @@ def test_random_cable_data_leave_the_demonstration_at_random():
     assert data["action"].abs().max() <= 0.02 + 1e-6
     # Uniform actions are far wider than the demonstrator's noise.
     assert data["action"][:, -8:].std() > 2 * demonstrations["action"][:, -8:].std()
+
+
+@pytest.mark.slow
+def test_pushing_demonstrations_hold_every_order_of_the_blocks_and_push_past_the_line():
+    data = collect_offline("pushing", "success", episodes=40, seed=0)
+    y = data["next", "state"][..., :21].unflatten(-1, (3, 7))[..., 1]
+    first = (y > 0.075).int().argmax(1)  # [40, 3], the step at which each block is in its goal
+    orders = {tuple(order) for order in first.argsort(-1).tolist()}
+    assert len(orders) == 6
+    assert (y[:, -1] > 0.085).float().mean() > 0.95
+
+
+@pytest.mark.slow
+def test_pushing_violations_start_from_any_number_of_blocks_in_their_goals():
+    data = collect_offline("pushing", "constraint", episodes=40, seed=0)
+    y = data["state"][..., :21].unflatten(-1, (3, 7))[..., 1]
+    in_goal = (y > 0.075).sum(-1)
+    shares = torch.bincount(in_goal.flatten(), minlength=4) / in_goal.numel()
+    assert (shares > 0.02).all()

@@ -101,6 +101,26 @@ def test_control_affine_members_see_their_own_column_alone():
     torch.testing.assert_close(twice - rest, 2 * (once - rest))
 
 
+@pytest.mark.parametrize("control_affine", [False, True])
+@pytest.mark.parametrize("scale", [0.05, [0.05, 2.0]])
+def test_actions_are_seen_in_their_unit(control_affine, scale):
+    torch.manual_seed(1)
+    plain = EnsembleDynamics(3, 2, num_members=4, hidden=(8,), control_affine=control_affine)
+    torch.manual_seed(1)
+    dynamics = EnsembleDynamics(3, 2, num_members=4, hidden=(8,), control_affine=control_affine, action_scale=scale)
+    latent, unit = torch.randn(5, 3), torch.randn(5, 2)
+    for one, other in zip(
+        dynamics.distribution(latent, unit * torch.tensor(scale)), plain.distribution(latent, unit), strict=True
+    ):
+        torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, [1.0, 2.0, 3.0], [[1.0, 2.0]]])
+def test_impossible_units_are_refused(scale):
+    with pytest.raises(ValueError, match="action_scale must be one positive number or one for each of 2 actions"):
+        EnsembleDynamics(3, 2, action_scale=scale)
+
+
 def test_distribution_gives_each_members_mean_and_scale_around_the_latent():
     dynamics = EnsembleDynamics(3, 2, num_members=4, hidden=(8,))
     latent, action = torch.randn(5, 3), torch.randn(5, 2)

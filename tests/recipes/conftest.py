@@ -17,3 +17,10 @@ def run_folder(tmp_path_factory):
     torch.manual_seed(0)
     ls3.train(config)
     return folder
+
+
+@pytest.fixture
+def config(request):
+    conf = request.config.rootpath / "recipes" / "conf"
+    with initialize_config_dir(str(conf), version_base="1.3"):
+        return compose("ls3", ["preset=smoke"])

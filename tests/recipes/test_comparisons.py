@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from helpers import Silent
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
@@ -14,7 +15,6 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 import comparisons
 import evaluate
-import ls3
 import report
 from comparisons import AWAC, SACfD
 from ls3_torchrl import LS3Agent
@@ -50,7 +50,12 @@ def configure(request):
 
 @pytest.mark.parametrize(
     ("task", "penalty", "gamma", "threshold"),
-    [("navigation", -3, 0.95, 0.8), ("reacher", -1, 0.55, 0.7), ("pushing", -3, 0.75, 0.7), ("cable_routing", -3, 0.55, 0.7)],
+    [
+        ("navigation", -3, 0.95, 0.8),
+        ("reacher", -1, 0.55, 0.7),
+        ("pushing", -3, 0.75, 0.7),
+        ("cable_routing", -3, 0.55, 0.7),
+    ],
 )
 def test_the_supplements_settings_per_task(configure, task, penalty, gamma, threshold):
     config = configure("sacfd_rrl", f"task={task}")
@@ -175,11 +180,6 @@ class Box:
     observation_spec = {"pixels": torch.zeros(3, 64, 64)}  # noqa: RUF012
 
 
-class Silent:
-    def log(self, phase, step, **values):
-        pass
-
-
 def parts(config, algorithm_class=None):
     algorithm_class = algorithm_class or comparisons.COMPARISONS[config.algorithm]
     return algorithm_class(comparisons.relevant(config), Box(), torch.device("cpu"))
@@ -191,7 +191,9 @@ def fill(algorithm, *tags):
     step = {"reward": -torch.ones(9, 1), "pixels": torch.zeros(9, 3, 64, 64, dtype=torch.uint8)}
     step["constraint"], step["success"] = (torch.arange(9)[:, None] == k for k in (4, 6))
     action = torch.zeros(9, 2)
-    episode = TensorDict({"pixels": step["pixels"], "action": action, "task_action": action + 1, "next": step}, [1, 9][1:])
+    episode = TensorDict(
+        {"pixels": step["pixels"], "action": action, "task_action": action + 1, "next": step}, [1, 9][1:]
+    )
     for tag in tags:
         buffer.add(episode, tag)
     if algorithm.vae is not None:
@@ -272,7 +274,9 @@ def test_units_of_the_actions_change_no_value(configure):
     assert rewards[0] == pytest.approx(rewards[1], abs=1e-5)
     target = [-2.0 + 2 * math.log(h) for h in (3.0, 0.03)]
     for box, value in zip((Box, Small), target, strict=True):
-        algorithm = SACfD(comparisons.relevant(configure("sacfd", "policy.learn_alpha=true")), box(), torch.device("cpu"))
+        algorithm = SACfD(
+            comparisons.relevant(configure("sacfd", "policy.learn_alpha=true")), box(), torch.device("cpu")
+        )
         fill(algorithm, "success")
         assert float(algorithm.both.loss.target_entropy) == pytest.approx(value, abs=1e-5)
 
@@ -306,7 +310,7 @@ class Walk:
 
 
 def walk_online(algorithm, teacher, rounds):
-    """Train an algorithm on walks: offline on the teacher's, online on its own. Mean steps to the goal of each round."""
+    """Train on walks: offline on the teacher's, online on its own. Mean steps to the goal, of each round."""
     data = {Tag.SUCCESS: Walk(20, teacher).rows.flatten()}
 
     def sample(batch_size, *, tags, pixels=False):
@@ -350,7 +354,9 @@ def test_from_slow_demonstrations_to_a_quick_agent(configure, algorithm_class):
     # No wall and λ = 0: what is left is to reach the goal, and sooner than the teacher.
     settings = ["policy.hidden=[64,64]", "policy.batch_size=128", "policy.cloning_steps=300", "policy.critic_steps=500"]
     more = ["policy.penalty=0", "policy.updates_per_step=1.5", "policy.lr=1e-3", "agent.latent_dim=2"]
-    algorithm = parts(configure(algorithm_class.name, *settings, *more, "online.episodes_per_update=4"), algorithm_class)
+    algorithm = parts(
+        configure(algorithm_class.name, *settings, *more, "online.episodes_per_update=4"), algorithm_class
+    )
     lengths = walk_online(algorithm, slow_teacher, 8)
     teacher = Walk(200, slow_teacher).steps
     assert lengths[0] < 1.3 * teacher  # it imitates

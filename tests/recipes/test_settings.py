@@ -1,10 +1,12 @@
 """Settings that would fail late are refused early."""
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from torchrl.data import Bounded
 
-from settings import check_settings
+from settings import agent_options, check_settings
 
 
 @pytest.fixture
@@ -43,6 +45,9 @@ def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_horizon(conf
         ("online.select", "first"),
         ("vae.prediction_horizon", 0),
         ("loss.dynamics_horizon", 0),
+        ("loss.success_tail", 0),
+        ("agent.action_scale", "range"),
+        ("vae.agent", "/nowhere.pt"),
     ],
 )
 def test_settings_that_would_fail_late_are_refused_early(config, name, value):
@@ -50,3 +55,12 @@ def test_settings_that_would_fail_late_are_refused_early(config, name, value):
     OmegaConf.update(config, name, value)
     with pytest.raises(ValueError, match=name.replace(".", r"\.")):
         check_settings(config)
+
+
+def test_box_is_half_the_range_of_each_action(config):
+    low, high = torch.tensor([-3.0, 0.0]), torch.tensor([1.0, 0.02])
+    for batch in ((), (4,)):
+        spec = Bounded(low=low.expand(*batch, 2), high=high.expand(*batch, 2), shape=(*batch, 2))
+        assert agent_options(config, spec)["action_scale"] == pytest.approx([2.0, 0.01])
+    config.agent.action_scale = 0.5
+    assert agent_options(config, spec)["action_scale"] == 0.5
