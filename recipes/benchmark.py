@@ -65,7 +65,7 @@ def plans(
 ) -> None:
     """Plans of a preset: the plain path, the fused one in each precision, and batches of environments."""
     torch.manual_seed(0)
-    agent = permissive(LS3Agent(spec.shape[-1], **preset.agent)).to(device)
+    agent = permissive(LS3Agent(spec.shape[-1], **agent_options(preset, spec))).to(device)
     options = {str(key): value for key, value in preset.planner.items()}
     name = preset.preset
     flops = plan_flops(agent, options)
