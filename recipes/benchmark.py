@@ -30,6 +30,7 @@ from ls3_torchrl.modules.ensemble import EnsembleMLP
 from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, VAELoss
 from ls3_torchrl.planners import ImaginationNoise, LS3Planner
 from plain import PlainVAE, plain_members
+from settings import agent_options
 from timing import Bench, matmul_peak, show
 
 
@@ -122,9 +123,10 @@ def agreement(agent: LS3Agent, options: dict[str, Any], spec: Bounded, frames: T
     return {"value_error": median(errors), "feasibility": fmean(disagreeing)}
 
 
-def updates(bench: Bench, preset: DictConfig, action_dim: int, device: torch.device, *, plain: bool) -> None:
+def updates(bench: Bench, preset: DictConfig, spec: Bounded, device: torch.device, *, plain: bool) -> None:
     """Gradient steps of a preset's losses; dynamics and values also as a loop over members."""
-    agent = LS3Agent(action_dim, **preset.agent).to(device)
+    action_dim = spec.shape[-1]
+    agent = LS3Agent(action_dim, **agent_options(preset, spec)).to(device)
     batch, d, name = preset.optim.batch_size, preset.agent.latent_dim, preset.preset
     members = agent.value.num_members
 
@@ -185,9 +187,9 @@ def updates(bench: Bench, preset: DictConfig, action_dim: int, device: torch.dev
         bench.time(f"safe set step, {name}, {precision}", lambda: (take(), target.step()))  # noqa: B023
 
 
-def vae(bench: Bench, preset: DictConfig, frames: Tensor, device: torch.device, *, plain: bool) -> None:
+def vae(bench: Bench, preset: DictConfig, spec: Bounded, frames: Tensor, device: torch.device, *, plain: bool) -> None:
     """VAE steps at batch 256 and at the preset's, and encoding."""
-    agent = LS3Agent(2, in_channels=frames.shape[1], **preset.agent).to(device)
+    agent = LS3Agent(spec.shape[-1], in_channels=frames.shape[1], **agent_options(preset, spec)).to(device)
     slow = PlainVAE(agent).to(device)
     for half in (agent.encoder, agent.decoder):
         half.to(memory_format=torch.channels_last)
@@ -269,15 +271,15 @@ def run(config: DictConfig) -> dict:
     for preset in presets:
         plans(bench, preset, flat, config.batches, device, plain=config.plain)
         with threads(1):  # as the recipes do
-            updates(bench, preset, flat.shape[-1], device, plain=config.plain)
+            updates(bench, preset, flat, device, plain=config.plain)
     episodes = ls3_envs.collect_offline(config.task, "success", episodes=8, seed=0)
-    vae(bench, presets[0], episodes["pixels"].flatten(0, 1), device, plain=config.plain)
+    vae(bench, presets[0], flat, episodes["pixels"].flatten(0, 1), device, plain=config.plain)
     for name in config.domains:
         for worlds in config.batches:
             environment_steps(bench, name, worlds, device)
     buffer = TaggedReplayBuffer(2000, latent_dim=presets[0].agent.latent_dim)
     buffer.add(episodes, Tag.SUCCESS)
-    buffer.encode(LS3Agent(flat.shape[-1], **presets[0].agent).encoder)
+    buffer.encode(LS3Agent(flat.shape[-1], **agent_options(presets[0], flat)).encoder)
     bench.time("sampling 256 transitions for each of 5 members", lambda: buffer.sample(256, members=5))
 
     if config.smoke:
