@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import binary_cross_entropy_with_logits
 from torchrl.data import Bounded
+from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 
 from ls3_torchrl._checks import require_keys
@@ -163,7 +164,7 @@ class SafetyCriticLoss(LossModule):
 
     def target(self, tensordict: TensorDictBase) -> Tensor:
         """C + (1 − c) γ_risk Q'_risk(s', a'), ``[*B, 1]``."""
-        with torch.no_grad():
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             after = tensordict.get(self.in_keys[1])
             rows = TensorDict({self.in_keys[0]: after}, batch_size=tensordict.batch_size)
             action = self.__dict__["policy"](rows)["action"]

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.data import Bounded
+from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import DDPGLoss, SoftUpdate
 
 from ls3_torchrl.baselines import (
@@ -88,6 +89,13 @@ def test_the_target_lags_and_the_policy_is_left_alone():
     assert not ours & {id(p) for p in policy.parameters()}
     loss(batch)["loss_safety"].backward()
     assert all(p.grad is None for p in policy.parameters())
+
+
+def test_the_next_action_is_drawn_from_the_policy_whatever_the_exploration_type():
+    loss = lagged(linear_critic(0.0, 4.0), gaussian_actor(SPEC, 1, hidden=(4,)))
+    batch = transitions([0.0] * 50, [0.0] * 50, [0.0] * 50, [False] * 50)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert loss.target(batch).std() > 0.05
 
 
 def test_risk_falls_by_gamma_with_every_step_from_the_cliff():
