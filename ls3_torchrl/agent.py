@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from torch import nn
 from torchrl.data import TensorSpec
 
 from ls3_torchrl._checks import require_at_least
+from ls3_torchrl.files import save_atomically
 from ls3_torchrl.modules import (
     ConstraintEstimator,
     EnsembleDynamics,
@@ -152,21 +152,13 @@ class LS3Agent(nn.Module):
 
     def save(self, path: str | Path) -> Path:
         """Write architecture and weights to one file; a half-written file never takes its place."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         content = {
             "format": FORMAT,
             "version": VERSION,
             "architecture": dataclasses.asdict(self.architecture),
             "state_dict": self.state_dict(),
         }
-        partial = path.with_name(path.name + ".partial")
-        with partial.open("wb") as file:
-            torch.save(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-        return path
+        return save_atomically(content, path)
 
     @classmethod
     def load(cls, path: str | Path, *, device: torch.device | str = "cpu", **expected: Any) -> LS3Agent:

@@ -82,19 +82,6 @@ class RunFolder:
         self._tensorboard.close()
 
 
-def write_atomically(content: dict, path: str | Path) -> Path:
-    """Save tensors in one go: a half-written file never takes the place of a whole one."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        torch.save(content, file)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
-    return path
-
-
 def read_metrics(folder: str | Path) -> list[dict[str, str]]:
     """The rows of a run's ``metrics.csv``."""
     with (Path(folder) / "metrics.csv").open(newline="") as file:

@@ -16,7 +16,7 @@ from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 from torchrl.objectives import BCLoss, DDPGLoss, SACLoss
 
 import pictures
-from common import RunFolder, write_atomically
+from common import RunFolder
 from learning import Learner
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.baselines import (
@@ -31,6 +31,7 @@ from ls3_torchrl.baselines import (
     gaussian_actor,
 )
 from ls3_torchrl.data import ALL_TAGS, Tag, TaggedReplayBuffer
+from ls3_torchrl.files import save_atomically
 from protocol import Algorithm, follow
 from representation import train_vae
 from settings import agent_options, check_comparison
@@ -85,18 +86,6 @@ class Comparison(Algorithm):
 
     def _seeing(self, policy: TensorDictModuleBase) -> TensorDictModuleBase:
         return policy if self.vae is None else TensorDictSequential(self.vae.encoder, policy)
-
-    def make_buffer(self, device: torch.device) -> TaggedReplayBuffer:
-        """With the means of the latents."""
-        config = self.config
-        return TaggedReplayBuffer(
-            config.task.buffer_capacity,
-            latent_dim=config.agent.latent_dim,
-            gamma=config.loss.gamma,
-            success_tail=config.loss.success_tail,
-            scratch_dir=config.scratch_dir,
-            device=device,
-        )
 
     def begin(self, buffer: TaggedReplayBuffer, run: RunFolder, horizon: int) -> None:
         """Make the learners."""
@@ -153,7 +142,7 @@ class Comparison(Algorithm):
             "algorithm": self.name,
             "state_dict": self.networks.state_dict(),
         }
-        return write_atomically(content, path)
+        return save_atomically(content, path)
 
     def restore(self, path: Path) -> None:
         """Take the weights of a file of the same algorithm."""
@@ -234,12 +223,9 @@ class SACfD(Comparison):
         assert isinstance(critic, SafetyCritic)
         return critic
 
-    def make_buffer(self, device: torch.device) -> TaggedReplayBuffer:
-        """With what the task's policy wanted, beside what was done."""
-        buffer = super().make_buffer(device)
-        if self.recovery:
-            buffer.extra_keys = ("task_action",)
-        return buffer
+    def make_buffer(self, device: torch.device, **labels: Any) -> TaggedReplayBuffer:
+        """With recovery, with what the task's policy wanted, beside what was done."""
+        return super().make_buffer(device, extra_keys=("task_action",) if self.recovery else (), **labels)
 
     def offline_data(self, offline: dict[Tag, TensorDictBase]) -> dict[Tag, TensorDictBase]:
         """What was done offline was what was wanted."""

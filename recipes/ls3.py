@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import hydra
 import torch
@@ -54,18 +55,9 @@ class LS3(Algorithm):
         """The planner carries its last plan on from step to step."""
         env.append_transform(self.policy.primer())
 
-    def make_buffer(self, device: torch.device) -> TaggedReplayBuffer:
-        """With returns and safe-set labels."""
-        config = self.config
-        return TaggedReplayBuffer(
-            config.task.buffer_capacity,
-            latent_dim=config.agent.latent_dim,
-            gamma=config.loss.gamma,
-            continue_failures=config.loss.continue_failures,
-            success_tail=config.loss.success_tail,
-            scratch_dir=config.scratch_dir,
-            device=device,
-        )
+    def make_buffer(self, device: torch.device, **labels: Any) -> TaggedReplayBuffer:
+        """Failures may go on for ever in its returns."""
+        return super().make_buffer(device, continue_failures=self.config.loss.continue_failures, **labels)
 
     def begin(self, buffer: TaggedReplayBuffer, run: RunFolder, horizon: int) -> None:
         """Make the learners of every equation."""

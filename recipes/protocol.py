@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -45,6 +46,7 @@ class Algorithm(ABC):
     name: str
     #: Tags of the offline data that it cannot do without.
     needs: tuple[Tag, ...] = (Tag.SUCCESS,)
+    config: DictConfig
     #: What acts; writes ``action``.
     policy: TensorDictModuleBase
 
@@ -58,9 +60,18 @@ class Algorithm(ABC):
         """The offline episodes as the buffer takes them."""
         return offline
 
-    @abstractmethod
-    def make_buffer(self, device: torch.device) -> TaggedReplayBuffer:
-        """An empty buffer with the labels that it learns from."""
+    def make_buffer(self, device: torch.device, **labels: Any) -> TaggedReplayBuffer:
+        """An empty buffer; ``labels`` are options of its own about what is kept of an episode."""
+        config = self.config
+        return TaggedReplayBuffer(
+            config.task.buffer_capacity,
+            latent_dim=config.agent.latent_dim,
+            gamma=config.loss.gamma,
+            success_tail=config.loss.success_tail,
+            scratch_dir=config.scratch_dir,
+            device=device,
+            **labels,
+        )
 
     @abstractmethod
     def begin(self, buffer: TaggedReplayBuffer, run: RunFolder, horizon: int) -> None:

@@ -17,7 +17,8 @@ MAY_IMPORT = {
     "planners": {"_checks", "modules"},
     "data": {"_checks", "modules"},
     "baselines": {"_checks", "modules", "objectives"},
-    "agent": {"_checks", "modules", "planners"},
+    "files": set(),
+    "agent": {"_checks", "files", "modules", "planners"},
     "__init__": {"agent"},
 }
 
