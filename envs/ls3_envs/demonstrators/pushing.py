@@ -13,8 +13,6 @@ _CLEAR_Y = -0.1
 _ALIGNED = 0.012
 #: So far past the line is a block pushed: what stops on the line teaches that nearly there is as good as there.
 _MARGIN = 0.015
-#: Probability per step that a stumble ends.
-_RISES = 0.35
 
 
 def _steer(state: Tensor, block: Tensor, speed: float) -> Tensor:
@@ -32,32 +30,13 @@ def _steer(state: Tensor, block: Tensor, speed: float) -> Tensor:
     return torch.stack([across, along], -1)
 
 
-class _Pusher(Scripted):
-    """Pushes blocks, with bursts of uniform actions in between."""
-
-    def _in_burst(self, state: Tensor, is_init: Tensor, begins: float, ends: float) -> Tensor:
-        """Whether each world is in a burst, bool ``[N, 1]``; each begins and ends with a probability per step."""
-        before = self._for_the_episode("burst", torch.zeros_like(state[:, :1]), is_init) > 0.5
-        chance = self._uniform(state, 1)
-        now = torch.where(before, chance >= ends, chance < begins)
-        self._kept["burst"] = now.to(state)
-        return now
-
-    def _anywhere(self, state: Tensor) -> Tensor:
-        return self._uniform(state, 2, -MAX_STEP, MAX_STEP)
-
-
-class PushingDemonstrator(_Pusher):
+class PushingDemonstrator(Scripted):
     """Guides the hand to one block after another and pushes it to its goal, straight and slowly.
 
     The blocks' order is drawn for each episode: with always the same one, the hand's place alone would tell how much
     is done, and values learnt from such demonstrations look at the hand and not at the blocks.
 
-    Now and then it stumbles: for a few steps the hand moves at random, and hits what it hits. It then goes on with the
-    blocks where they lie. Demonstrations that never leave the way tell nothing of how to come back to it.
-
     Args:
-        stumble: probability per step that it begins to stumble.
         noise_std: standard deviation of the noise on the displacements, in metres.
         seed: seed of that noise.
 
@@ -70,21 +49,19 @@ class PushingDemonstrator(_Pusher):
         True
     """
 
-    def __init__(self, *, stumble: float = 0.03, noise_std: float = 0.005, seed: int = 0) -> None:
+    def __init__(self, *, noise_std: float = 0.005, seed: int = 0) -> None:
         super().__init__(limit=MAX_STEP, noise_std=noise_std, seed=seed)
-        self.stumble = stumble
 
     def _act(self, state: Tensor, step: Tensor, is_init: Tensor) -> Tensor:
         waiting = block_positions(state)[..., 1] <= GOAL_Y + _MARGIN
         order = self._for_the_episode("order", self._uniform(state, 3), is_init)
         action = _steer(state, order.masked_fill(~waiting, 2.0).argmin(-1), speed=0.012)
-        action = torch.where(self._in_burst(state, is_init, self.stumble, _RISES), self._anywhere(state), action)
         retreat = torch.zeros_like(action)
         retreat[:, 1] = (_CLEAR_Y - hand_position(state)[:, 1]).clamp(min=-MAX_STEP)
         return torch.where(waiting.any(-1, keepdim=True), action, retreat)
 
 
-class PushingViolator(_Pusher):
+class PushingViolator(Scripted):
     """Pushes blocks on and on, with bursts of uniform actions in between: random and violating data.
 
     Each stretch between two bursts has a block of its own, drawn at random.
@@ -112,8 +89,12 @@ class PushingViolator(_Pusher):
     def _act(self, state: Tensor, step: Tensor, is_init: Tensor) -> Tensor:
         any_block = self._uniform(state, 1, 0.0, 3.0)
         block = self._for_the_episode("block", any_block, is_init)
-        before = self._for_the_episode("burst", torch.zeros_like(state[:, :1]), is_init)
-        bursting = self._in_burst(state, is_init, self.burst, self.calm)
+        bursting = self._for_the_episode("bursting", torch.zeros_like(state[:, :1]), is_init) > 0.5
+        chance = self._uniform(state, 1)
+        ends = bursting & (chance < self.calm)
+        bursting = torch.where(bursting, ~ends, chance < self.burst)
         # After each burst another block.
-        block = self._kept["block"] = torch.where((before > 0.5) & ~bursting, any_block, block)
-        return torch.where(bursting, self._anywhere(state), _steer(state, block.long().squeeze(-1), speed=0.04))
+        block = torch.where(ends, any_block, block)
+        self._kept["block"], self._kept["bursting"] = block, bursting.to(state)
+        uniform = self._uniform(state, 2, -MAX_STEP, MAX_STEP)
+        return torch.where(bursting, uniform, _steer(state, block.long().squeeze(-1), speed=0.04))
