@@ -104,6 +104,10 @@ class Learner:
                 value = value + self.beside.weight * beside
         return losses, value
 
+    def _tells(self, key: str, item: Tensor) -> bool:
+        """Whether an output is worth logging: scalars, and of the losses those that are descended."""
+        return item.numel() == 1 and (not key.startswith("loss_") or key.removeprefix("loss_") in self.names)
+
     def train(self, steps: int, what: str, run: RunFolder) -> None:
         """Take ``steps`` gradient steps."""
         if self.tau is not None and self.target is None:
@@ -126,7 +130,7 @@ class Learner:
                     self.target.step()
                 self.steps += 1
                 if i % LOG_EVERY == 0 or i == steps - 1:
-                    scalars = {key: item.item() for key, item in losses.items() if item.numel() == 1}
+                    scalars = {key: item.item() for key, item in losses.items() if self._tells(key, item)}
                     if not all(map(math.isfinite, scalars.values())):
                         raise FloatingPointError(
                             f"{what} diverged: {scalars} at step {self.steps}. Lower its learning rate."

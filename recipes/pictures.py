@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -114,15 +115,17 @@ def learning_curves(folder: Path) -> None:
     plt.close(figure)
 
     losses = {key: points for key, points in series.items() if key[1].startswith("loss_")}
-    figure, axes = plt.subplots(2, 4, figsize=(12, 4.6), squeeze=False)
+    of_phase = Counter(phase for phase, _ in losses)
+    height = max(-(-len(losses) // 4), 1)
+    figure, axes = plt.subplots(height, 4, figsize=(12, 2.3 * height), squeeze=False)
     for axis in axes.flat[len(losses) :]:
         axis.axis("off")
-    for axis, ((phase, _), points) in zip(axes.flat, losses.items(), strict=False):
+    for axis, ((phase, name), points) in zip(axes.flat, losses.items(), strict=False):
         x, y = np.array(points).T
         axis.plot(x, y, lw=1.2, color=INK)
         if (y > 0).all():
             axis.set_yscale("log")
-        axis.set_title(phase)
+        axis.set_title(phase if of_phase[phase] == 1 else f"{phase}: {name.removeprefix('loss_')}")
         axis.grid(color=PALE, alpha=0.4, lw=0.6)
     figure.tight_layout()
     figure.savefig(folder / "losses.png")

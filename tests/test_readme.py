@@ -21,6 +21,13 @@ def test_python_blocks_run_one_after_another():
     assert all(p.grad is not None for p in namespace["loss"].safe_set_params.values(True, True))
 
 
+def test_the_python_of_the_other_documents_runs_by_itself():
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "comparisons.md").read_text(), flags=re.DOTALL)
+    assert blocks
+    for block in blocks:
+        exec(compile(block, "comparisons.md", "exec"), {})
+
+
 @pytest.mark.parametrize("line", re.findall(r"^python recipes/.*$", README, flags=re.MULTILINE))
 def test_commands_compose(line):
     _, script, *overrides = line.split("#")[0].split()

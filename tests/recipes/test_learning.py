@@ -42,7 +42,11 @@ def test_several_losses_are_descended_together_and_the_target_moves_a_share_of_t
     for names, moved in (("qvalue", [False, True]), (["actor", "qvalue"], [True, True])):
         params = (loss.actor_network_params, loss.qvalue_network_params)
         before = [p.clone().data for p in params]
-        Learner(names, loss, batch.clone, lr=0.1, tau=0.25).train(1, "AWAC", Silent())
+        run = Silent()
+        Learner(names, loss, batch.clone, lr=0.1, tau=0.25).train(1, "AWAC", run)
+        # What is not descended is not reported as a loss.
+        logged = {key for key in run.rows[0][2] if key.startswith("loss_")}
+        assert logged == {f"loss_{name}" for name in ([names] if isinstance(names, str) else names)}
         assert [bool((a != b.data).any()) for a, b in zip(before, params, strict=True)] == moved
     learner = Learner("qvalue", loss, batch.clone, lr=0.1, tau=0.25)
     learner.train(1, "AWAC", Silent())  # its updater starts from a copy
