@@ -156,7 +156,8 @@ def follow(config: DictConfig, algorithm_class: type[Algorithm]) -> dict:
 
     with timed(seconds, "demonstrations"):
         if offline is None:
-            offline = collect_demonstrations(config, seed["demonstrations"])
+            with torch.random.fork_rng():  # what is learnt does not depend on whether the data were there already
+                offline = collect_demonstrations(config, seed["demonstrations"])
             folder = save_episodes(offline, run.path / "demonstrations", task=config.task.name, seed=config.seed)
             offline = load_episodes(folder)  # from the disk from now on: there may be more pictures than memory
         buffer = algorithm.make_buffer(device)
