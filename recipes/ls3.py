@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +89,8 @@ class LS3(Algorithm):
         return self.agent.save(path)
 
     def restore(self, path: Path) -> None:
-        """Take the networks of such a file."""
-        self.agent.load_state_dict(LS3Agent.load(path).state_dict())
+        """Take the networks of such a file; one of another shape, or with actions in other units, is refused."""
+        self.agent.load_state_dict(LS3Agent.load(path, **asdict(self.agent.architecture)).state_dict())
 
     def draw(
         self,

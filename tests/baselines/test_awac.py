@@ -72,7 +72,7 @@ def test_weights_have_mean_one_and_are_finite_whatever_the_rewards_scale(tempera
 def test_entropy_is_worth_nothing():
     losses = make()(batch())
     assert losses["alpha"] < 1e-20
-    assert not losses["loss_alpha"].requires_grad or losses["loss_alpha"].abs() < 1e3
+    assert not losses["loss_alpha"].requires_grad
 
 
 def test_actions_on_the_edge_count_as_those_just_inside():

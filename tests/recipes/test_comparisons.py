@@ -349,8 +349,11 @@ def slow_teacher(td):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("algorithm_class", "share"), [(SACfD, 0.75), (AWAC, 0.92)])  # AWAC keeps close to its data
-def test_from_slow_demonstrations_to_a_quick_agent(configure, algorithm_class, share):
+@pytest.mark.parametrize(
+    ("algorithm_class", "own"),
+    [(SACfD, []), (AWAC, ["policy.tau=0.05"])],  # hundreds of gradient steps, not thousands: critics that lag less
+)
+def test_from_slow_demonstrations_to_a_quick_agent(configure, algorithm_class, own):
     # No wall and λ = 0: what is left is to reach the goal, and sooner than the teacher.
     settings = ["policy.hidden=[64,64]", "policy.batch_size=128", "policy.cloning_steps=300", "policy.critic_steps=500"]
     more = ["policy.penalty=0", "policy.updates_per_step=1.5", "policy.lr=1e-3", "agent.latent_dim=2"]
@@ -360,4 +363,4 @@ def test_from_slow_demonstrations_to_a_quick_agent(configure, algorithm_class, s
     lengths = walk_online(algorithm, slow_teacher, 8)
     teacher = Walk(200, slow_teacher).steps
     assert lengths[0] < 1.3 * teacher  # it imitates
-    assert sum(lengths[-3:]) / 3 < share * teacher  # and improves
+    assert lengths[-1] < 0.75 * teacher  # and improves
