@@ -359,7 +359,7 @@ def test_from_slow_demonstrations_to_a_quick_agent(configure, algorithm_class, o
     settings = ["policy.hidden=[64,64]", "policy.batch_size=128", "policy.cloning_steps=300", "policy.critic_steps=500"]
     more = ["policy.penalty=0", "policy.updates_per_step=1.5", "policy.lr=1e-3", "agent.latent_dim=2"]
     algorithm = parts(
-        configure(algorithm_class.name, *settings, *more, "online.episodes_per_update=4"), algorithm_class
+        configure(algorithm_class.name, *settings, *more, *own, "online.episodes_per_update=4"), algorithm_class
     )
     lengths = walk_online(algorithm, slow_teacher, 8)
     teacher = Walk(200, slow_teacher).steps
