@@ -2,6 +2,7 @@
 
 from ls3_torchrl.baselines.awac import AWACLoss
 from ls3_torchrl.baselines.networks import (
+    ObservedAction,
     PixelFeatures,
     action_bounds,
     action_value,
@@ -12,6 +13,7 @@ from ls3_torchrl.baselines.recovery import RecoveryPolicy, SafetyCritic, SafetyC
 
 __all__ = [
     "AWACLoss",
+    "ObservedAction",
     "PixelFeatures",
     "RecoveryPolicy",
     "SafetyCritic",

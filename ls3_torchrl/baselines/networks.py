@@ -52,23 +52,40 @@ class PixelFeatures(nn.Module):
         return self.convolutions(pixels.float() / 255.0)
 
 
-class _Critic(nn.Module):
-    """A network of what is observed and the action, which it sees in units of half its range."""
+class ObservedAction(nn.Module):
+    """What a critic sees: the observation, or its features, beside the action in units of half its range.
+
+    Args:
+        action_spec: of one action ``[A]``, or batched.
+        features: reads the observation first.
+
+    Example:
+        >>> seen = ObservedAction(Bounded(low=0.0, high=4.0, shape=(1,)))
+        >>> seen(torch.zeros(2, 3), torch.tensor([[0.0], [3.0]]))[:, 3:].flatten().tolist()
+        [-1.0, 0.5]
+    """
 
     middle: Tensor
     reach: Tensor
 
-    def __init__(
-        self, low: Tensor, high: Tensor, features: nn.Module | None, in_features: int, hidden: Sequence[int]
-    ) -> None:
+    def __init__(self, action_spec: Bounded, features: nn.Module | None = None) -> None:
         super().__init__()
+        low, high = action_bounds(action_spec)
         self.features = nn.Identity() if features is None else features
-        self.network = MLP(in_features + len(low), 1, num_cells=list(hidden), activation_class=nn.ReLU)
         self.register_buffer("middle", (high + low) / 2, persistent=False)
         self.register_buffer("reach", (high - low) / 2, persistent=False)
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        return self.network(torch.cat([self.features(observation), (action - self.middle) / self.reach], -1))
+        """``[*B, F + A]`` of observations ``[*B, …]`` and actions ``[*B, A]``."""
+        return torch.cat([self.features(observation), (action - self.middle) / self.reach], -1)
+
+
+class _TwoInputs(nn.Sequential):
+    """A sequence whose first part takes two inputs."""
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        seen, network = self
+        return network(seen(observation, action))
 
 
 def _actor_network(
@@ -160,5 +177,7 @@ def action_value(
         >>> critic(td)["state_action_value"].shape
         torch.Size([4, 1])
     """
-    low, high = action_bounds(action_spec)
-    return ValueOperator(_Critic(low, high, features, in_features, hidden), in_keys=[observation_key, "action"])
+    width = in_features + action_spec.shape[-1]
+    mlp = MLP(width, 1, num_cells=list(hidden), activation_class=nn.ReLU)
+    network = _TwoInputs(ObservedAction(action_spec, features), mlp)
+    return ValueOperator(network, in_keys=[observation_key, "action"])

@@ -16,7 +16,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 
 from ls3_torchrl._checks import require_keys
-from ls3_torchrl.baselines.networks import action_bounds
+from ls3_torchrl.baselines.networks import ObservedAction
 from ls3_torchrl.modules.ensemble import EnsembleMLP
 from ls3_torchrl.objectives._evaluate import as_scalars
 from ls3_torchrl.objectives.value import check_discount
@@ -51,9 +51,6 @@ class SafetyCritic(TensorDictModuleBase):
 
     out_keys = ["risk_logit", "risk", "safety"]  # noqa: RUF012
 
-    middle: Tensor
-    reach: Tensor
-
     def __init__(
         self,
         action_spec: Bounded,
@@ -65,17 +62,14 @@ class SafetyCritic(TensorDictModuleBase):
         hidden: Sequence[int] = (256, 256),
     ) -> None:
         super().__init__()
-        low, high = action_bounds(action_spec)
         self.in_keys = [observation_key, "action"]
-        self.features = nn.Identity() if features is None else features
-        self.network = EnsembleMLP(in_features + len(low), 1, num_members=num_members, hidden=hidden)
-        self.register_buffer("middle", (high + low) / 2, persistent=False)
-        self.register_buffer("reach", (high - low) / 2, persistent=False)
+        self.seen = ObservedAction(action_spec, features)
+        width = in_features + action_spec.shape[-1]
+        self.network = EnsembleMLP(width, 1, num_members=num_members, hidden=hidden)
 
     def logits(self, observation: Tensor, action: Tensor) -> Tensor:
         """Every member's logit of the risk, ``[*B, M]``."""
-        seen = torch.cat([self.features(observation), (action - self.middle) / self.reach], -1)
-        return self.network(seen).squeeze(-1)
+        return self.network(self.seen(observation, action)).squeeze(-1)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write logits, risk and safety."""

@@ -68,7 +68,7 @@ def test_log_probabilities_by_hand():
 
 def test_the_critic_sees_actions_in_units_of_half_the_box():
     critic = action_value(box(), 4, hidden=(8,))
-    inner = critic.module.network
+    inner = critic.module[1]
     z, action = torch.randn(6, 4), LOW + (HIGH - LOW) * torch.rand(6, 2)
     value = critic(TensorDict({"loc": z, "action": action}, [6]))["state_action_value"]
     unit = 2 * (action - LOW) / (HIGH - LOW) - 1
