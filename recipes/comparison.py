@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 from torchrl.objectives import BCLoss
 
+import agent_pictures
 import pictures
 from common import RunFolder
 from learning import Learner
@@ -155,7 +156,7 @@ class Comparison(Algorithm):
     ) -> None:
         """Reconstructions of the VAE; value and risk over the plane where the states are one."""
         if self.vae is not None:
-            pictures.reconstructions(folder, self.vae, offline)
+            agent_pictures.reconstructions(folder, self.vae, offline)
         env = pictures.plane_of(self.config)
         if env is None:
             return

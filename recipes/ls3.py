@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-import pictures
+import agent_pictures
 from common import RunFolder
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
@@ -100,7 +100,7 @@ class LS3(Algorithm):
         evaluation: TensorDictBase,
     ) -> None:
         """Reconstructions, timelines, and maps and plans where the states are a plane."""
-        pictures.draw_agent(folder, self.config, self.agent, self.policy, offline, evaluation)
+        agent_pictures.draw_agent(folder, self.config, self.agent, self.policy, offline, evaluation)
 
 
 def train(config: DictConfig) -> dict:
