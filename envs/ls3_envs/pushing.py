@@ -21,7 +21,9 @@ BLOCKS_Y = 0.0
 #: Past this line a block is in its goal.
 GOAL_Y = 0.075
 HAND_START = (0.0, -0.14)
-HAND_RADIUS = 0.018
+#: Half sides of a gripper seen from above, across and along; as wide as jaws that take a block.
+GRIPPER = (0.04, 0.012)
+PEG_RADIUS = 0.018
 #: The hand stays on the table and in the picture: largest |x|, least and largest y.
 HAND_X, HAND_Y = 0.27, (-0.175, 0.185)
 MAX_STEP = 0.05
@@ -29,6 +31,12 @@ START_STD = 0.003
 SUBSTEPS = 40
 HORIZON = 150
 
+HandName = Literal["gripper", "peg"]
+
+_HANDS: dict[HandName, str] = {
+    "gripper": f'type="box" size="{GRIPPER[0]} {GRIPPER[1]} .03"',
+    "peg": f'type="cylinder" size="{PEG_RADIUS} .03"',
+}
 _COLOURS = ("0.85 0.2 0.2", "0.95 0.75 0.15", "0.6 0.3 0.8")
 
 
@@ -41,8 +49,8 @@ def _block(number: int, x: float) -> str:
     </body>"""
 
 
-def pushing_model() -> mujoco.MjModel:
-    """Table, three blocks, a cylindrical hand on two slides, and a camera above the table.
+def pushing_model(hand: HandName = "gripper") -> mujoco.MjModel:
+    """Table, three blocks, a hand on two slides, and a camera above the table.
 
     The hand hangs on an arm that reaches in from the front and touches nothing: a hand alone is a dozen of 4,096
     pixels, which a VAE passes over.
@@ -70,7 +78,7 @@ def pushing_model() -> mujoco.MjModel:
     <body name="hand" pos="0 0 .035">
       <joint name="hand_x" type="slide" axis="1 0 0" range="-{HAND_X} {HAND_X}" limited="true"/>
       <joint name="hand_y" type="slide" axis="0 1 0" range="{HAND_Y[0]} {HAND_Y[1]}" limited="true"/>
-      <geom name="hand" type="cylinder" size="{HAND_RADIUS} .03" mass=".5" rgba=".95 .95 .95 1"/>
+      <geom name="hand" {_HANDS[hand]} mass=".5" rgba=".95 .95 .95 1"/>
       <geom name="arm" type="box" pos="0 -.25 .034" size=".012 .25 .004" mass="0" rgba=".95 .95 .95 1"
             contype="0" conaffinity="0"/>
     </body>
@@ -105,6 +113,8 @@ class SequentialPushingEnv(MujocoEnv):
 
     Args:
         num_worlds: N.
+        hand: ``"gripper"``, 8 cm wide and flat: what it pushes at an angle or off the centre goes on straight; or
+            ``"peg"``, round and 3.6 cm wide: what it does not hit in the middle turns and slips away.
         start: ``"fixed"`` has the hand in front of the blocks, with noise of 3 mm; ``"random"`` anywhere in front of
             them.
         horizon: steps in an episode.
@@ -120,7 +130,7 @@ class SequentialPushingEnv(MujocoEnv):
         place and all velocities, ``[N, 43]``.
 
     Raises:
-        ValueError: for an unknown ``start``, and as the base classes do.
+        ValueError: for an unknown ``start`` or ``hand``, and as the base classes do.
 
     Example:
         >>> env = SequentialPushingEnv(num_worlds=2, seed=0)
@@ -132,6 +142,7 @@ class SequentialPushingEnv(MujocoEnv):
         self,
         num_worlds: int = 1,
         *,
+        hand: HandName = "gripper",
         start: Literal["fixed", "random"] = "fixed",
         horizon: int = HORIZON,
         image_size: int = 64,
@@ -143,9 +154,11 @@ class SequentialPushingEnv(MujocoEnv):
     ) -> None:
         if start not in ("fixed", "random"):
             raise ValueError(f"start must be 'fixed' or 'random', got {start!r}.")
+        if hand not in _HANDS:
+            raise ValueError(f"hand must be 'gripper' or 'peg', got {hand!r}.")
         self.start = start
         super().__init__(
-            pushing_model(),
+            pushing_model(hand),
             "above",
             num_worlds=num_worlds,
             action_low=(-MAX_STEP, -MAX_STEP),

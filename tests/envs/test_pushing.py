@@ -5,7 +5,7 @@ import torch
 from torchrl.envs import step_mdp
 
 from ls3_envs import SequentialPushingEnv
-from ls3_envs.pushing import BLOCKS_X, GOAL_Y, TABLE, block_positions, hand_position
+from ls3_envs.pushing import BLOCKS_X, GOAL_Y, GRIPPER, PEG_RADIUS, TABLE, block_positions, hand_position
 
 
 def with_blocks_at(y: list[float], z: float = 0.03) -> torch.Tensor:
@@ -80,3 +80,33 @@ def test_the_arm_is_a_picture_only():
     assert int(arm.contype[0]) == int(arm.conaffinity[0]) == 0
     env = SequentialPushingEnv(num_worlds=1, seed=0)
     assert float(env.model.body("hand").mass[0]) == pytest.approx(0.5)
+
+
+def pushed_askew(hand: str, offset: float) -> tuple[float, float]:
+    """How far the middle block goes along y and turns, pushed 10 cm by a hand that is off its middle."""
+    env = SequentialPushingEnv(num_worlds=1, hand=hand, seed=0)
+    td = env.reset()
+    env._state[0, 21:23] = torch.tensor([offset, -0.06])
+    for _ in range(2):
+        td = step_mdp(env.step(td.set("action", torch.tensor([[0.0, 0.05]]))))
+    w, z = td["state"][0, 10], td["state"][0, 13]
+    return float(block_positions(td["state"])[0, 1, 1]), abs(float(2 * torch.atan2(z, w)))
+
+
+def test_a_gripper_takes_a_block_straight_on_and_a_peg_turns_it():
+    straight, straight_turn = pushed_askew("gripper", 0.025)
+    askew, askew_turn = pushed_askew("peg", 0.025)
+    assert straight > 0.06
+    assert straight_turn < 0.1
+    assert askew < straight - 0.005
+    assert askew_turn > 0.5
+
+
+def test_a_peg_in_the_middle_pushes_as_a_gripper_does():
+    gripper, peg = (pushed_askew(hand, 0.0)[0] for hand in ("gripper", "peg"))
+    assert abs(peg - gripper - (PEG_RADIUS - GRIPPER[1])) < 2e-3
+
+
+def test_an_unknown_hand_is_answered_with_the_known_ones():
+    with pytest.raises(ValueError, match="'gripper' or 'peg', got 'claw'"):
+        SequentialPushingEnv(hand="claw")
