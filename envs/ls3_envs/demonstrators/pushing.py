@@ -82,7 +82,7 @@ class PushingViolator(Scripted):
         torch.Size([2, 3])
     """
 
-    def __init__(self, *, burst: float = 0.2, calm: float = 0.1, noise_std: float = 0.004, seed: int = 0) -> None:
+    def __init__(self, *, burst: float = 0.2, calm: float = 0.3, noise_std: float = 0.004, seed: int = 0) -> None:
         super().__init__(limit=MAX_STEP, noise_std=noise_std, seed=seed)
         self.burst, self.calm = burst, calm
 
