@@ -92,6 +92,8 @@ def check_settings(config: DictConfig) -> None:
     _not_negative(config, "loss.failure_weight", "loss.undecided_weight")
     if not 0.0 <= optim.cooldown <= 1.0:
         raise ValueError(f"optim.cooldown must be a share in [0, 1], got {optim.cooldown}.")
+    if not 0.0 <= config.online.share < 1.0:
+        raise ValueError(f"online.share must be a share in [0, 1), got {config.online.share}.")
     unknown = set(loss.mean_latents) - set(MEAN_LATENTS)
     if unknown:
         raise ValueError(

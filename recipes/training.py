@@ -42,7 +42,8 @@ class Training:
         self._left_out = None if loss.frozen_dynamics else "frozen"
 
         def draw(tags: tuple, members: int | None = None, **options: Any) -> Callable[[], TensorDictBase]:
-            return lambda: buffer.sample(batch, tags=tags, members=members if bootstrap else None, **options)
+            options |= {"tags": tags, "members": members if bootstrap else None, "online_share": config.online.share}
+            return lambda: buffer.sample(batch, **options)
 
         how: dict[str, Any] = {
             "bf16": wants_bf16(optim.autocast, next(agent.parameters()).device),
@@ -123,7 +124,7 @@ class Training:
 
     def _safe_or_not(self) -> TensorDictBase:
         """Rows of all data; how much those of undecided online episodes count is a setting."""
-        rows = self.buffer.sample(self.config.optim.batch_size, tags=ALL_TAGS)
+        rows = self.buffer.sample(self.config.optim.batch_size, tags=ALL_TAGS, online_share=self.config.online.share)
         weight = self.config.loss.undecided_weight
         if weight != 1.0:
             undecided = rows["undecided"] & (rows["tag"] == int(Tag.ONLINE))

@@ -251,6 +251,7 @@ class TaggedReplayBuffer:
         without: NestedKey | None = None,
         steps: int | None = None,
         pixels: bool = False,
+        online_share: float = 0.0,
     ) -> TensorDictBase:
         """Transitions with freshly drawn latents, uniformly from the union of the tags.
 
@@ -261,6 +262,8 @@ class TaggedReplayBuffer:
             without: label whose rows are left out, such as ``"frozen"``.
             steps: K for stretches of K transitions of one episode, in their order.
             pixels: add ``pixels`` and ``("next", "pixels")``; then no encoder is needed, and latents are zero without.
+            online_share: least share of online transitions, once there are some and ``tags`` has them. Where offline
+                data are many, a uniform draw hardly shows what the agent itself has met.
 
         Returns:
             ``[B]``, or ``[B, M]``, or either with K behind, with ``latent`` and ``("next", "latent")`` drawn from the
@@ -269,7 +272,12 @@ class TaggedReplayBuffer:
         if self._encoder is None and not pixels:
             raise RuntimeError("The buffer has no latents yet: call buffer.encode(encoder) after training the VAE.")
         count = batch_size * (members or 1)
-        rows = self._stretches(count, tags, without, steps or 1)[1]
+        wanted = sorted({Tag.parse(tag) for tag in tags})
+        online = self._online_rows(count, wanted, without, steps or 1, online_share)
+        offline = [tag for tag in wanted if tag is not Tag.ONLINE] if online else wanted
+        groups = [(count - online, offline), (online, [Tag.ONLINE])]
+        parts = [self._stretches(n, some, without, steps or 1)[1] for n, some in groups if n]
+        rows: TensorDictBase = parts[0] if len(parts) == 1 else torch.cat(parts)
         if pixels:
             for group, slot in zip((rows, rows.get("next")), self._slots(rows["frame"]), strict=True):
                 group.set("pixels", self.pixels.storage[slot]["pixels"])
@@ -279,6 +287,18 @@ class TaggedReplayBuffer:
             group.set("latent", torch.addcmul(loc, group.get("scale"), torch.randn_like(loc)))
         shape = (batch_size, *([] if members is None else [members]), *([] if steps is None else [steps]))
         return rows.reshape(shape)
+
+    def _online_rows(self, count: int, tags: list[Tag], without: NestedKey | None, steps: int, share: float) -> int:
+        """How many of ``count`` transitions are drawn from online data apart; 0 where a uniform draw has as many."""
+        if not 0.0 <= share < 1.0:
+            raise ValueError(f"online_share must be in [0, 1), got {share}.")
+        if share == 0.0 or Tag.ONLINE not in tags or len(tags) == 1:
+            return 0
+        online, total = (
+            self.view(some, without=without, steps=steps).sampler.rows(self.latents.storage).numel()
+            for some in ([Tag.ONLINE], tags)
+        )
+        return round(share * count) if 0 < online < share * total else 0
 
     def _stretches(
         self, count: int, tags: Iterable[Tag | str], without: NestedKey | None, steps: int

@@ -43,6 +43,7 @@ def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_horizon(conf
         ("optim.lr", -1.0),
         ("online.episodes_per_update", 0),
         ("online.select", "first"),
+        ("online.share", 1.0),
         ("vae.prediction_horizon", 0),
         ("loss.dynamics_horizon", 0),
         ("loss.success_tail", 0),

@@ -16,9 +16,12 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(config):
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
     drawn = {}
 
-    def sample(batch_size, *, tags, members=None, without=None, steps=None):
+    OmegaConf.update(config, "online.share", 0.25)
+
+    def sample(batch_size, *, tags, members=None, without=None, steps=None, online_share):
         assert without is None
         assert steps is None
+        assert online_share == 0.25
         drawn[current] = ({tag.name.lower() for tag in tags}, members)
         raise KeyboardInterrupt
 
