@@ -28,6 +28,8 @@ PEG_RADIUS = 0.018
 HAND_X, HAND_Y = 0.27, (-0.175, 0.185)
 MAX_STEP = 0.05
 START_STD = 0.003
+#: How likely each block is in its goal already when an episode starts at random.
+IN_GOAL_AT_RANDOM = 0.3
 SUBSTEPS = 40
 HORIZON = 150
 
@@ -116,7 +118,7 @@ class SequentialPushingEnv(MujocoEnv):
         hand: ``"gripper"``, 8 cm wide and flat: what it pushes at an angle or off the centre goes on straight; or
             ``"peg"``, round and 3.6 cm wide: what it does not hit in the middle turns and slips away.
         start: ``"fixed"`` has the hand in front of the blocks, with noise of 3 mm; ``"random"`` anywhere in front of
-            them.
+            them, each with probability .3 in its goal already.
         horizon: steps in an episode.
         image_size: side of the image in pixels.
         physics: ``"mujoco"``, or ``"warp"`` for a GPU.
@@ -179,6 +181,9 @@ class SequentialPushingEnv(MujocoEnv):
         place = generator.normal(HAND_START, START_STD)
         if self.start == "random":
             place = generator.uniform((-0.25, -0.18), (0.25, -0.06))
+            there = generator.random(3) < IN_GOAL_AT_RANDOM
+            y = np.where(there, generator.uniform(GOAL_Y + 0.01, TABLE[1] - 0.03, 3), BLOCKS_Y)
+            state[1:21:7] = torch.as_tensor(y)
         state[21:23] = torch.as_tensor(place)
         return state
 

@@ -30,6 +30,12 @@ def _steer(state: Tensor, block: Tensor, speed: float) -> Tensor:
     return torch.stack([across, along], -1)
 
 
+def _straight_at(state: Tensor, block: Tensor, speed: float) -> Tensor:
+    """The straight way to a block's centre, from wherever the hand is: actions ``[N, 2]`` towards the blocks ``[N]``."""
+    place = block_positions(state)[torch.arange(len(state), device=state.device), block, :2]
+    return speed * torch.nn.functional.normalize(place - hand_position(state), dim=-1)
+
+
 class PushingDemonstrator(Scripted):
     """Guides the hand to one block after another and pushes it to its goal, straight and slowly.
 
@@ -62,9 +68,10 @@ class PushingDemonstrator(Scripted):
 
 
 class PushingViolator(Scripted):
-    """Pushes blocks on and on, with bursts of uniform actions in between: random and violating data.
+    """Moves towards the blocks, with bursts of uniform actions in between: random and violating data.
 
-    Each stretch between two bursts has a block of its own, drawn at random.
+    Each stretch between two bursts has a block of its own, drawn at random. Every other one, on average, goes straight
+    at it from wherever the hand is, and hits it from the side, too; the others come from the front and push on and on.
 
     Use it with ``SequentialPushingEnv(start="random")``.
 
@@ -82,19 +89,22 @@ class PushingViolator(Scripted):
         torch.Size([2, 3])
     """
 
-    def __init__(self, *, burst: float = 0.2, calm: float = 0.3, noise_std: float = 0.004, seed: int = 0) -> None:
+    def __init__(self, *, burst: float = 0.4, calm: float = 0.4, noise_std: float = 0.004, seed: int = 0) -> None:
         super().__init__(limit=MAX_STEP, noise_std=noise_std, seed=seed)
         self.burst, self.calm = burst, calm
 
     def _act(self, state: Tensor, step: Tensor, is_init: Tensor) -> Tensor:
-        any_block = self._uniform(state, 1, 0.0, 3.0)
+        # Another block, and one of two manners, after each burst.
+        any_block, any_manner = self._uniform(state, 1, 0.0, 3.0), self._uniform(state, 1)
         block = self._for_the_episode("block", any_block, is_init)
+        manner = self._for_the_episode("manner", any_manner, is_init)
         bursting = self._for_the_episode("bursting", torch.zeros_like(state[:, :1]), is_init) > 0.5
         chance = self._uniform(state, 1)
         ends = bursting & (chance < self.calm)
         bursting = torch.where(bursting, ~ends, chance < self.burst)
-        # After each burst another block.
-        block = torch.where(ends, any_block, block)
-        self._kept["block"], self._kept["bursting"] = block, bursting.to(state)
+        block, manner = torch.where(ends, any_block, block), torch.where(ends, any_manner, manner)
+        self._kept |= {"block": block, "manner": manner, "bursting": bursting.to(state)}
         uniform = self._uniform(state, 2, -MAX_STEP, MAX_STEP)
-        return torch.where(bursting, uniform, _steer(state, block.long().squeeze(-1), speed=0.04))
+        towards = block.long().squeeze(-1)
+        steady = torch.where(manner < 0.5, _straight_at(state, towards, 0.04), _steer(state, towards, 0.04))
+        return torch.where(bursting, uniform, steady)
