@@ -64,3 +64,11 @@ def test_pushing_violations_start_from_any_number_of_blocks_in_their_goals():
     in_goal = (y > 0.075).sum(-1)
     shares = torch.bincount(in_goal.flatten(), minlength=4) / in_goal.numel()
     assert (shares > 0.02).all()
+
+
+@pytest.mark.slow
+def test_pushing_violations_hit_the_blocks_from_the_side_too():
+    data = collect_offline("pushing", "constraint", episodes=40, seed=0)
+    x = data["state"][..., :21].unflatten(-1, (3, 7))[..., 0]
+    aside = (data["next", "state"][..., :21].unflatten(-1, (3, 7))[..., 0] - x).abs().amax(-1) > 0.01
+    assert aside.float().mean() > 0.02

@@ -5,7 +5,17 @@ import torch
 from torchrl.envs import step_mdp
 
 from ls3_envs import SequentialPushingEnv
-from ls3_envs.pushing import BLOCKS_X, GOAL_Y, GRIPPER, PEG_RADIUS, TABLE, block_positions, hand_position
+from ls3_envs.pushing import (
+    BLOCK_SIDE,
+    BLOCKS_X,
+    GOAL_Y,
+    GRIPPER,
+    IN_GOAL_AT_RANDOM,
+    PEG_RADIUS,
+    TABLE,
+    block_positions,
+    hand_position,
+)
 
 
 def with_blocks_at(y: list[float], z: float = 0.03) -> torch.Tensor:
@@ -80,6 +90,17 @@ def test_the_arm_is_a_picture_only():
     assert int(arm.contype[0]) == int(arm.conaffinity[0]) == 0
     env = SequentialPushingEnv(num_worlds=1, seed=0)
     assert float(env.model.body("hand").mass[0]) == pytest.approx(0.5)
+
+
+def test_a_random_start_has_each_block_in_its_place_or_in_its_goal():
+    state = SequentialPushingEnv(num_worlds=200, start="random", seed=0).reset()["state"]
+    y = block_positions(state)[..., 1]
+    waiting, there = y == 0.0, (y > GOAL_Y) & (y < TABLE[1] - BLOCK_SIDE / 2)
+    assert (waiting | there).all()
+    assert abs(there.float().mean() - IN_GOAL_AT_RANDOM) < 0.06
+    assert len(there.unique(dim=0)) == 8  # every combination
+    torch.testing.assert_close(block_positions(state)[..., 0], torch.tensor(BLOCKS_X).expand(200, 3))
+    assert (hand_position(state)[:, 1] <= -0.06).all()
 
 
 def pushed_askew(hand: str, offset: float) -> tuple[float, float]:

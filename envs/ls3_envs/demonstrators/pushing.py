@@ -31,7 +31,7 @@ def _steer(state: Tensor, block: Tensor, speed: float) -> Tensor:
 
 
 def _straight_at(state: Tensor, block: Tensor, speed: float) -> Tensor:
-    """The straight way to a block's centre, from wherever the hand is: actions ``[N, 2]`` towards the blocks ``[N]``."""
+    """Straight to a block's centre from wherever the hand is: actions ``[N, 2]`` towards the blocks ``[N]``."""
     place = block_positions(state)[torch.arange(len(state), device=state.device), block, :2]
     return speed * torch.nn.functional.normalize(place - hand_position(state), dim=-1)
 
