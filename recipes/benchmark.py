@@ -256,7 +256,12 @@ def run(config: DictConfig) -> dict:
 
     Returns:
         What is written to ``benchmark.json``.
+
+    Raises:
+        ValueError: without a preset: encoder and buffer are timed at the first one's sizes.
     """
+    if not config.presets:
+        raise ValueError("presets must name at least one preset, such as presets=[cpu]; got none.")
     device = choose_device(config.device)
     if config.threads:
         torch.set_num_threads(config.threads)

@@ -99,3 +99,12 @@ def test_what_takes_long_is_timed_once():
     assert bench.rows[0]["runs"] == 1
     assert bench.rows[0]["iqr_ms"] == 0.0
     assert bench.rows[0]["median_ms"] > 0.0
+
+
+def test_a_benchmark_without_presets_is_refused_before_anything_is_timed(tmp_path):
+    settings = ["presets=[]", f"output={tmp_path / 'bench'}"]
+    with initialize_config_dir(str(Path(benchmark.__file__).parent / "conf"), version_base="1.3"):
+        config = compose("benchmark", settings)
+    with pytest.raises(ValueError, match="at least one preset, such as presets="):
+        benchmark.run(config)
+    assert not (tmp_path / "bench").exists()
