@@ -45,6 +45,8 @@ class Training:
             options |= {"tags": tags, "members": members if bootstrap else None, "online_share": config.online.share}
             return lambda: buffer.sample(batch, **options)
 
+        everything = draw(ALL_TAGS)
+
         how: dict[str, Any] = {
             "bf16": wants_bf16(optim.autocast, next(agent.parameters()).device),
             "cooldown": optim.cooldown,
@@ -92,13 +94,13 @@ class Training:
         self.safe_set = Learner(
             "safe_set",
             SafeSetLoss(agent.safe_set, gamma=loss.gamma_safe_set),
-            self._safe_or_not,
+            lambda: self._weighed(everything()),
             lr=optim.lr,
             **how,
             target_interval=interval,
         )
-        self.constraint = Learner("constraint", ClassifierLoss(agent.constraint), draw(ALL_TAGS), lr=optim.lr, **how)
-        self.goal = Learner("goal", goal, draw(ALL_TAGS), lr=optim.lr, **how)
+        self.constraint = Learner("constraint", ClassifierLoss(agent.constraint), everything, lr=optim.lr, **how)
+        self.goal = Learner("goal", goal, everything, lr=optim.lr, **how)
         for name in loss.mean_latents:
             keys = {"latent": "loc", "next_latent": ("next", "loc")}
             getattr(self, name).loss.set_keys(**(keys if name == "dynamics" else {"latent": ("next", "loc")}))
@@ -122,9 +124,8 @@ class Training:
             value = -(1.0 - loss.gamma**horizon) / (1.0 - loss.gamma) if loss.gamma < 1.0 else -float(horizon)
         return rows.set("reward_to_go", torch.full_like(rows["reward_to_go"], value))
 
-    def _safe_or_not(self) -> TensorDictBase:
-        """Rows of all data; how much those of undecided online episodes count is a setting."""
-        rows = self.buffer.sample(self.config.optim.batch_size, tags=ALL_TAGS, online_share=self.config.online.share)
+    def _weighed(self, rows: TensorDictBase) -> TensorDictBase:
+        """The rows for equation (5); how much those of undecided online episodes count is a setting."""
         weight = self.config.loss.undecided_weight
         if weight != 1.0:
             undecided = rows["undecided"] & (rows["tag"] == int(Tag.ONLINE))

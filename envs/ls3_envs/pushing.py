@@ -21,10 +21,10 @@ BLOCKS_Y = 0.0
 #: Past this line a block is in its goal.
 GOAL_Y = 0.075
 HAND_START = (0.0, -0.14)
-#: Half sides of a gripper seen from above, across and along; as wide as jaws that take a block.
+#: Half sides of the gripper, along x and y: about as wide as open jaws that would take a block.
 GRIPPER = (0.04, 0.012)
 PEG_RADIUS = 0.018
-#: The hand stays on the table and in the picture: largest |x|, least and largest y.
+#: The hand's middle stays on the table and in the picture: largest |x|, least and largest y.
 HAND_X, HAND_Y = 0.27, (-0.175, 0.185)
 MAX_STEP = 0.05
 START_STD = 0.003
@@ -115,8 +115,8 @@ class SequentialPushingEnv(MujocoEnv):
 
     Args:
         num_worlds: N.
-        hand: ``"gripper"``, 8 cm wide and flat: what it pushes at an angle or off the centre goes on straight; or
-            ``"peg"``, round and 3.6 cm wide: what it does not hit in the middle turns and slips away.
+        hand: ``"gripper"``, 8 cm wide and flat: a block that it hits off its middle still goes straight on; or ``"peg"``,
+            round and 3.6 cm wide: such a block turns and slips away.
         start: ``"fixed"`` has the hand in front of the blocks, with noise of 3 mm; ``"random"`` anywhere in front of
             them, each with probability .3 in its goal already.
         horizon: steps in an episode.

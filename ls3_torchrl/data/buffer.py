@@ -97,7 +97,7 @@ class TaggedReplayBuffer:
 
         self.pixels = TensorDictReplayBuffer(storage=storage(self.pixel_capacity, "pixels"), sampler=RandomSampler())
         self.latents = TensorDictReplayBuffer(storage=storage(self.capacity, "latents"), sampler=RandomSampler())
-        self._views: dict[tuple[tuple[Tag, ...], NestedKey | None, int], TensorDictReplayBuffer] = {}
+        self._views: dict[tuple[tuple[Tag, ...], NestedKey | None, int, float], TensorDictReplayBuffer] = {}
         self._encoder: PixelEncoder | None = None
         self._frames_written = 0
 
@@ -219,7 +219,12 @@ class TaggedReplayBuffer:
         return TensorDict({"loc": loc, "scale": scale}, [len(frames)])
 
     def view(
-        self, tags: Iterable[Tag | str] = ALL_TAGS, *, without: NestedKey | None = None, steps: int = 1
+        self,
+        tags: Iterable[Tag | str] = ALL_TAGS,
+        *,
+        without: NestedKey | None = None,
+        steps: int = 1,
+        online_share: float = 0.0,
     ) -> TensorDictReplayBuffer:
         """A TorchRL buffer on the same latent store that samples from the union of ``tags``.
 
@@ -227,12 +232,13 @@ class TaggedReplayBuffer:
             tags: what to draw from.
             without: label whose rows are left out, such as ``"frozen"``.
             steps: only rows that so many steps of their episode begin with.
+            online_share: least share of online rows in a draw; see :class:`~ls3_torchrl.data.TagSampler`.
         """
-        key = (tuple(sorted({Tag.parse(tag) for tag in tags})), without, steps)
+        key = (tuple(sorted({Tag.parse(tag) for tag in tags})), without, steps, online_share)
         if key not in self._views:
             self._views[key] = TensorDictReplayBuffer(
                 storage=self.latents.storage,
-                sampler=TagSampler(key[0], without=without, steps=steps),
+                sampler=TagSampler(key[0], without=without, steps=steps, online_share=online_share),
                 writer=ImmutableDatasetWriter(),
             )
         return self._views[key]
@@ -253,7 +259,7 @@ class TaggedReplayBuffer:
         pixels: bool = False,
         online_share: float = 0.0,
     ) -> TensorDictBase:
-        """Transitions with freshly drawn latents, uniformly from the union of the tags.
+        """Transitions with freshly drawn latents, uniformly from the union of the tags where no share is asked for.
 
         Args:
             batch_size: B.
@@ -262,8 +268,7 @@ class TaggedReplayBuffer:
             without: label whose rows are left out, such as ``"frozen"``.
             steps: K for stretches of K transitions of one episode, in their order.
             pixels: add ``pixels`` and ``("next", "pixels")``; then no encoder is needed, and latents are zero without.
-            online_share: least share of online transitions, once there are some and ``tags`` has them. Where offline
-                data are many, a uniform draw hardly shows what the agent itself has met.
+            online_share: least share of online transitions; see :class:`~ls3_torchrl.data.TagSampler`.
 
         Returns:
             ``[B]``, or ``[B, M]``, or either with K behind, with ``latent`` and ``("next", "latent")`` drawn from the
@@ -272,12 +277,7 @@ class TaggedReplayBuffer:
         if self._encoder is None and not pixels:
             raise RuntimeError("The buffer has no latents yet: call buffer.encode(encoder) after training the VAE.")
         count = batch_size * (members or 1)
-        wanted = sorted({Tag.parse(tag) for tag in tags})
-        online = self._online_rows(count, wanted, without, steps or 1, online_share)
-        offline = [tag for tag in wanted if tag is not Tag.ONLINE] if online else wanted
-        groups = [(count - online, offline), (online, [Tag.ONLINE])]
-        parts = [self._stretches(n, some, without, steps or 1)[1] for n, some in groups if n]
-        rows: TensorDictBase = parts[0] if len(parts) == 1 else torch.cat(parts)
+        rows = self._stretches(count, tags, without, steps or 1, online_share)[1]
         if pixels:
             for group, slot in zip((rows, rows.get("next")), self._slots(rows["frame"]), strict=True):
                 group.set("pixels", self.pixels.storage[slot]["pixels"])
@@ -288,23 +288,16 @@ class TaggedReplayBuffer:
         shape = (batch_size, *([] if members is None else [members]), *([] if steps is None else [steps]))
         return rows.reshape(shape)
 
-    def _online_rows(self, count: int, tags: list[Tag], without: NestedKey | None, steps: int, share: float) -> int:
-        """How many of ``count`` transitions are drawn from online data apart; 0 where a uniform draw has as many."""
-        if not 0.0 <= share < 1.0:
-            raise ValueError(f"online_share must be in [0, 1), got {share}.")
-        if share == 0.0 or Tag.ONLINE not in tags or len(tags) == 1:
-            return 0
-        online, total = (
-            self.view(some, without=without, steps=steps).sampler.rows(self.latents.storage).numel()
-            for some in ([Tag.ONLINE], tags)
-        )
-        return round(share * count) if 0 < online < share * total else 0
-
     def _stretches(
-        self, count: int, tags: Iterable[Tag | str], without: NestedKey | None, steps: int
+        self,
+        count: int,
+        tags: Iterable[Tag | str],
+        without: NestedKey | None,
+        steps: int,
+        online_share: float = 0.0,
     ) -> tuple[TensorDictBase, TensorDictBase]:
         """The first rows ``[count]`` of stretches of one episode each, and all of their rows ``[count * steps]``."""
-        view = self.view(tags, without=without, steps=steps)
+        view = self.view(tags, without=without, steps=steps, online_share=online_share)
         first = view.sample(count)
         if steps == 1:
             return first, first

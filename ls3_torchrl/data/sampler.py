@@ -1,4 +1,4 @@
-"""Uniform sampling from the rows that carry given tags."""
+"""Sampling from the rows that carry given tags: uniformly, or with a least share of online ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ls3_torchrl.data.tags import Tag
 
 
 class TagSampler(Sampler):
-    """Draws rows with replacement, uniformly over the union of some tags.
+    """Draws rows with replacement, uniformly over the union of some tags, or with a least share of online ones.
 
     The indices are cached, since a scan of the tags costs more than a draw: call :meth:`refresh` after rows
     were written or relabelled (:class:`~ls3_torchrl.data.TaggedReplayBuffer` does).
@@ -27,8 +27,11 @@ class TagSampler(Sampler):
         without: where the rows say, bool ``[1]``, whether they are left out; none is when ``None``.
         steps: rows are drawn that begin a stretch of so many steps of one episode, none of which is left out.
         steps_left_key: where the rows keep how many steps their episode has from them on, int64 ``[1]``.
+        online_share: least share of online rows in a draw, in [0, 1), once there are some. Where offline data are many,
+            a uniform draw hardly shows what the agent itself has met.
 
     Raises:
+        ValueError: without a tag, for steps below 1 or a share outside [0, 1).
         RuntimeError: when no row carries one of the tags.
 
     Example:
@@ -51,18 +54,23 @@ class TagSampler(Sampler):
         without: NestedKey | None = None,
         steps: int = 1,
         steps_left_key: NestedKey = "steps_left",
+        online_share: float = 0.0,
     ) -> None:
         super().__init__()
         self.tags = tuple(sorted({Tag.parse(tag) for tag in tags}))
         if not self.tags:
             raise ValueError("A TagSampler needs at least one tag; none was given.")
+        if not 0.0 <= online_share < 1.0:
+            raise ValueError(f"online_share must be in [0, 1), got {online_share}.")
+        self.online_share = online_share
         self.tag_key, self.without = tag_key, without
         self.steps, self.steps_left_key = require_at_least(steps, 1, "steps"), steps_left_key
         self._rows: Tensor | None = None
+        self._cached_parts: list[Tensor] | None = None
 
     def refresh(self) -> None:
         """Forget the cached indices."""
-        self._rows = None
+        self._rows = self._cached_parts = None
 
     def rows(self, storage: Storage) -> Tensor:
         """Indices of the rows with one of the tags, int64 ``[n]``."""
@@ -83,6 +91,15 @@ class TagSampler(Sampler):
                 self._rows = found.nonzero().flatten()
         return self._rows
 
+    def _parts(self, storage: Storage) -> list[Tensor]:
+        """Offline and online rows apart, where a uniform draw would hold too few of the latter; else all in one."""
+        if self._cached_parts is None:
+            rows = self.rows(storage)
+            online = storage[:].get(self.tag_key).flatten()[rows] == int(Tag.ONLINE)
+            too_few = 0.0 < online.float().mean() < self.online_share
+            self._cached_parts = [rows[~online], rows[online]] if too_few else [rows]
+        return self._cached_parts
+
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
         """Indices ``[batch_size]``."""
         rows = self.rows(storage)
@@ -92,7 +109,13 @@ class TagSampler(Sampler):
                 f"The buffer ({len(storage)} rows) holds no data tagged {names}. "
                 "Collect such episodes and add them with that tag before training what learns from them."
             )
-        return rows[torch.randint(rows.numel(), (batch_size,), device=rows.device)], {}
+        parts = self._parts(storage)
+        online = round(self.online_share * batch_size) if len(parts) == 2 else 0
+        drawn = [
+            part[torch.randint(part.numel(), (count,), device=part.device)]
+            for part, count in zip(parts, (batch_size - online, online), strict=False)
+        ]
+        return torch.cat(drawn), {}
 
     def add(self, index: int) -> None:
         """A row was written."""

@@ -91,3 +91,48 @@ def test_nested_tag_key():
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8), sampler=TagSampler(["rand"], tag_key=("meta", "tag")))
     buffer.extend(TensorDict({"meta": {"tag": torch.tensor([[0], [1]], dtype=torch.uint8)}}, [2]))
     assert buffer.sample(3)["meta", "tag"].flatten().tolist() == [1, 1, 1]
+
+
+def shares(buffer, count=400):
+    """Share of each of the first four tags in a draw."""
+    return (torch.bincount(buffer.sample(count)["tag"].flatten().long(), minlength=4) / count).tolist()
+
+
+def buffer_with_share(tags, share, wanted=("success", "rand", "online")):
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(256), sampler=TagSampler(wanted, online_share=share))
+    buffer.extend(rows(tags))
+    return buffer
+
+
+def test_few_online_rows_have_their_share_and_the_others_stay_uniform():
+    torch.manual_seed(0)
+    buffer = buffer_with_share([0] * 60 + [1] * 30 + [3] * 10, share=0.5)
+    success, rand, constraint, online = shares(buffer, 30_000)
+    assert online == 0.5
+    assert constraint == 0.0
+    assert abs(success - 2 * rand) < 0.02  # 60 rows to 30
+    drawn = buffer.sample(30_000)["id"].flatten()
+    counts = torch.bincount(drawn, minlength=100)
+    assert (counts[:90] - 167).abs().max() < 5 * 13  # binomial: 15,000 over 90 rows
+    assert (counts[90:] - 1500).abs().max() < 5 * 39
+
+
+@pytest.mark.parametrize(("tags", "online"), [([0] * 10, 0.0), ([3] * 10, 1.0), ([0] * 10 + [3] * 90, 0.9)])
+def test_none_and_many_online_rows_are_drawn_as_they_are(tags, online):
+    torch.manual_seed(0)
+    assert abs(shares(buffer_with_share(tags, share=0.5), 10_000)[3] - online) < 0.02
+
+
+def test_the_share_follows_rows_that_come_later():
+    buffer = buffer_with_share([0] * 90, share=0.25)
+    assert shares(buffer)[3] == 0.0
+    buffer.extend(rows([3] * 3, first=90))
+    assert shares(buffer)[3] == 0.25
+    buffer.extend(rows([3] * 150, first=93))
+    assert shares(buffer)[3] > 0.5
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0])
+def test_impossible_shares_are_refused(share):
+    with pytest.raises(ValueError, match=rf"online_share must be in \[0, 1\), got {share}"):
+        TagSampler(["online"], online_share=share)

@@ -9,6 +9,8 @@ from ls3_envs.mujoco import MujocoPhysics, WarpPhysics, make_physics
 from ls3_envs.pushing import pushing_model
 from ls3_envs.reacher import reacher_model
 
+MODELS = {"reacher": reacher_model(), "gripper": pushing_model(), "peg": pushing_model("peg")}
+
 
 def states_and_controls(model: mujoco.MjModel, worlds: int, substeps: int) -> tuple[torch.Tensor, torch.Tensor]:
     rng = np.random.default_rng(0)
@@ -37,7 +39,7 @@ def test_a_step_is_mj_step_repeated():
         assert np.array_equal(moved[row].numpy(), np.concatenate([data.qpos, data.qvel]))
 
 
-@pytest.mark.parametrize("model", [reacher_model(), pushing_model()], ids=["reacher", "pushing"])
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_the_same_bits_whatever_the_batch_and_the_number_of_threads(model):
     state, control = states_and_controls(model, 6, 10)
     whole = MujocoPhysics(model, threads=1)(state, control)
@@ -46,7 +48,7 @@ def test_the_same_bits_whatever_the_batch_and_the_number_of_threads(model):
     assert torch.equal(torch.cat([parts(state[i : i + 2], control[i : i + 2]) for i in (0, 2, 4)]), whole)
 
 
-@pytest.mark.parametrize("model", [reacher_model(), pushing_model()], ids=["reacher", "pushing"])
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_warp_follows_c_mujoco_closely(model):
     state, control = states_and_controls(model, 2, 8)
     exact = MujocoPhysics(model, threads=1)(state, control)
