@@ -115,8 +115,8 @@ class SequentialPushingEnv(MujocoEnv):
 
     Args:
         num_worlds: N.
-        hand: ``"gripper"``, 8 cm wide and flat: a block that it hits off its middle still goes straight on; or ``"peg"``,
-            round and 3.6 cm wide: such a block turns and slips away.
+        hand: ``"gripper"``, 8 cm wide and flat: a block that it hits off its middle still goes straight on; or
+            ``"peg"``, round and 3.6 cm wide: such a block turns and slips away.
         start: ``"fixed"`` has the hand in front of the blocks, with noise of 3 mm; ``"random"`` anywhere in front of
             them, each with probability .3 in its goal already.
         horizon: steps in an episode.
