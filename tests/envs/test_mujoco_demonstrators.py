@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from ls3_envs import collect_offline
+from ls3_envs.pushing import block_positions
 
 
 def shares(name: str, kind: str, episodes: int) -> tuple[float, float, torch.Tensor]:
@@ -50,7 +51,7 @@ def test_random_cable_data_leave_the_demonstration_at_random():
 @pytest.mark.slow
 def test_pushing_demonstrations_hold_every_order_of_the_blocks_and_push_past_the_line():
     data = collect_offline("pushing", "success", episodes=40, seed=0)
-    y = data["next", "state"][..., :21].unflatten(-1, (3, 7))[..., 1]
+    y = block_positions(data["next", "state"])[..., 1]
     first = (y > 0.075).int().argmax(1)  # [40, 3], the step at which each block is in its goal
     orders = {tuple(order) for order in first.argsort(-1).tolist()}
     assert len(orders) == 6
@@ -60,7 +61,7 @@ def test_pushing_demonstrations_hold_every_order_of_the_blocks_and_push_past_the
 @pytest.mark.slow
 def test_pushing_violations_start_from_any_number_of_blocks_in_their_goals():
     data = collect_offline("pushing", "constraint", episodes=40, seed=0)
-    y = data["state"][..., :21].unflatten(-1, (3, 7))[..., 1]
+    y = block_positions(data["state"])[..., 1]
     in_goal = (y > 0.075).sum(-1)
     shares = torch.bincount(in_goal.flatten(), minlength=4) / in_goal.numel()
     assert (shares > 0.02).all()
@@ -69,6 +70,6 @@ def test_pushing_violations_start_from_any_number_of_blocks_in_their_goals():
 @pytest.mark.slow
 def test_pushing_violations_hit_the_blocks_from_the_side_too():
     data = collect_offline("pushing", "constraint", episodes=40, seed=0)
-    x = data["state"][..., :21].unflatten(-1, (3, 7))[..., 0]
-    aside = (data["next", "state"][..., :21].unflatten(-1, (3, 7))[..., 0] - x).abs().amax(-1) > 0.01
-    assert aside.float().mean() > 0.02
+    moved = block_positions(data["next", "state"])[..., 0] - block_positions(data["state"])[..., 0]
+    # From the front, with bursts as wild, it is one step in 200.
+    assert (moved.abs().amax(-1) > 0.01).float().mean() > 0.02
