@@ -106,7 +106,7 @@ def plans(
         latent = _encode(agent, env.render_states(state[None]))["latent"]
         draws = torch.rand(1, candidates, horizon, space.low.shape[-1], device=latent.device)
         actions = space.low + (space.high - space.low) * draws
-        verdict = planner.judge(
+        verdict = planner.score_plans(
             planner.statistics(latent, actions),
             torch.full((1, 1), planner.safe_set_threshold, device=latent.device),
         )

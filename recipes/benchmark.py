@@ -114,11 +114,11 @@ def agreement(agent: LS3Agent, options: dict[str, Any], spec: Bounded, frames: T
         plans = torch.cat([planner.plan(latent, noise=noise).actions for planner in (exact, rough)])[None]
         drawn = ImaginationNoise(noise.members[0], noise.dynamics[0][:, :, :, :1])
         threshold = torch.full((1, 1), exact.safe_set_threshold, device=latent.device)
-        one, other = exact.judge(exact.imagine(latent, plans, drawn), threshold).score[0]
+        one, other = exact.score_plans(exact.imagine(latent, plans, drawn), threshold).score[0]
         errors.append(float((one - other).abs() / one.abs().clamp(min=1.0)))
         uniform = torch.rand(1, exact.cem.num_candidates, exact.horizon, *space.low.shape, device=latent.device)
         candidates = space.low + (space.high - space.low) * uniform
-        verdicts = [p.judge(p.imagine(latent, candidates, drawn), threshold).feasible for p in (exact, rough)]
+        verdicts = [p.score_plans(p.imagine(latent, candidates, drawn), threshold).feasible for p in (exact, rough)]
         disagreeing.append(float((verdicts[0] != verdicts[1]).float().mean()))
     return {"value_error": median(errors), "feasibility": fmean(disagreeing)}
 
@@ -226,7 +226,7 @@ def vae(bench: Bench, preset: DictConfig, spec: Bounded, frames: Tensor, device:
 
 def environment_steps(bench: Bench, domain: str, worlds: int, device: torch.device) -> None:
     """Steps of a domain with pixels, and how many of them a second of one core makes."""
-    env = ls3_envs.make(domain, num_worlds=worlds, seed=0, device=device)
+    env = ls3_envs.make(domain, num_envs=worlds, seed=0, device=device)
     td = env.rand_action(env.reset())
     busy, steps = time.process_time(), 0
 
@@ -270,7 +270,7 @@ def run(config: DictConfig) -> dict:
     bench = Bench(config.seconds)
     peaks = {str(t).removeprefix("torch."): matmul_peak(bench, t, device) for t in (torch.float32, torch.bfloat16)}
 
-    env = ls3_envs.make(config.task, num_worlds=1, seed=0)
+    env = ls3_envs.make(config.task, num_envs=1, seed=0)
     spec = env.action_spec
     flat = Bounded(low=spec.space.low[0], high=spec.space.high[0], shape=spec.shape[1:], device=device)
     for preset in presets:

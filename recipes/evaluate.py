@@ -56,7 +56,7 @@ def evaluate(config: DictConfig) -> dict:
         "hardware": hardware(device),
         "agent": str(folder / config.agent),
     }
-    pictures.film(run.path / "evaluation.gif", episodes)
+    pictures.video(run.path / "evaluation.gif", episodes)
     summary["minutes"] = round(run.seconds / 60, 2)
     run.write_json("summary.json", summary)
     run.close()

@@ -39,7 +39,7 @@ def cooled_down(share: float, cooldown: float) -> float:
     return 1.0 if share < 1.0 - cooldown else (1.0 - share) / cooldown
 
 
-class Term(NamedTuple):
+class AuxiliaryLoss(NamedTuple):
     """A second loss on the same network, with batches of its own.
 
     Attributes:
@@ -78,12 +78,12 @@ class Learner:
         lr: float,
         target_interval: int | None = None,
         tau: float | None = None,
-        beside: Term | None = None,
+        auxiliary: AuxiliaryLoss | None = None,
         bf16: bool = False,
         cooldown: float = 0.0,
     ) -> None:
         self.names = [names] if isinstance(names, str) else list(names)
-        self.loss, self.sample, self.beside, self.bf16 = loss, sample, beside, bf16
+        self.loss, self.sample, self.auxiliary, self.bf16 = loss, sample, auxiliary, bf16
         self.lr, self.cooldown = lr, cooldown
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True)
@@ -91,17 +91,17 @@ class Learner:
         self.target: HardUpdate | SoftUpdate | None = None
         self.steps = 0
 
-    def evaluate(self) -> tuple[TensorDictBase, Tensor]:
+    def compute_loss(self) -> tuple[TensorDictBase, Tensor]:
         """What the losses write for a new batch, and the sum that is descended."""
         rows = self.sample()
-        second = None if self.beside is None else self.beside.sample()
+        second = None if self.auxiliary is None else self.auxiliary.sample()
         with torch.autocast(self.parameters[0].device.type, torch.bfloat16, enabled=self.bf16):
             losses = self.loss(rows)
             value = torch.stack([losses[f"loss_{name}"] for name in self.names]).sum()
-            if self.beside is not None:
-                beside = self.beside.loss(second)[f"loss_{self.names[0]}"]
-                losses["beside"] = beside.detach()
-                value = value + self.beside.weight * beside
+            if self.auxiliary is not None:
+                auxiliary = self.auxiliary.loss(second)[f"loss_{self.names[0]}"]
+                losses["auxiliary"] = auxiliary.detach()
+                value = value + self.auxiliary.weight * auxiliary
         return losses, value
 
     def _tells(self, key: str, item: Tensor) -> bool:
@@ -122,7 +122,7 @@ class Learner:
             for i in range(steps):
                 for group in self.optimizer.param_groups:
                     group["lr"] = self.lr * cooled_down(i / steps, self.cooldown)
-                losses, value = self.evaluate()
+                losses, value = self.compute_loss()
                 self.optimizer.zero_grad()
                 value.backward()
                 self.optimizer.step()

@@ -80,7 +80,7 @@ class LS3(Algorithm):
         """How often the planner relaxed the safe set or fell back."""
         return dict(describe_plan(episodes).to_dict())
 
-    def judge(self, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> dict[str, float]:
+    def diagnose(self, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> dict[str, float]:
         """How much of the world's state latents and imagination hold."""
         return probe(self.agent, list(offline.values()), evaluation, self.config.planner.horizon)
 

@@ -59,7 +59,7 @@ def draw_run(
     """
     with plt.rc_context(STYLE), torch.no_grad():
         learning_curves(folder)
-        film(folder / "evaluation.gif", evaluation)
+        video(folder / "evaluation.gif", evaluation)
         env = plane_of(config)
         if env is not None:
             paths(folder, env, offline, tracks, evaluation)
@@ -67,7 +67,7 @@ def draw_run(
 
 def plane_of(config: DictConfig) -> ls3_envs.VisualConstraintEnv | None:
     """The task's environment, where its states are a plane that maps can be drawn of."""
-    env = ls3_envs.make(config.task.name, num_worlds=1, seed=config.seed).base_env
+    env = ls3_envs.make(config.task.name, num_envs=1, seed=config.seed).base_env
     return None if env.plane() is None else env
 
 
@@ -210,7 +210,7 @@ def paths(
     plt.close(figure)
 
 
-def film(path: Path, episodes: TensorDictBase, *, count: int = 6, zoom: int = 3, gap: int = 6) -> None:
+def video(path: Path, episodes: TensorDictBase, *, count: int = 6, zoom: int = 3, gap: int = 6) -> None:
     """A GIF of some episodes side by side, each framed green in the goal and red once it violated."""
     frames = []
     shown = episodes[:count]

@@ -89,7 +89,7 @@ class Algorithm(ABC):
         """Figures of the policy's own about episodes that it acted in, for the metrics."""
         return {}
 
-    def judge(self, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> dict[str, float]:
+    def diagnose(self, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> dict[str, float]:
         """Figures about what it has learnt, for the summary."""
         return {}
 
@@ -218,7 +218,7 @@ def follow(config: DictConfig, algorithm_class: type[Algorithm]) -> dict:
         algorithm.prepare(world)
         evaluation = run_episodes(world, algorithm.policy, what="Evaluation")
     with timed(seconds, "probe"):
-        probed = algorithm.judge(offline, evaluation)
+        probed = algorithm.diagnose(offline, evaluation)
     summary = {
         "algorithm": algorithm.name,
         "task": config.task.name,

@@ -99,7 +99,7 @@ def train_vae(agent: LS3Agent, buffer: TaggedReplayBuffer, config: DictConfig, r
     def draw(count: int) -> TensorDictBase:
         if not weight:
             return buffer.sample_pixels(count)
-        steps, left_out = options.prediction_horizon, None if config.loss.frozen_dynamics else "frozen"
+        steps, left_out = options.prediction_horizon, None if config.loss.frozen_dynamics else "after_violation"
         return buffer.sample_pixel_transitions(count, without=left_out, steps=steps if steps > 1 else None)
 
     with threads(options.threads), progress(options.steps, "VAE") as bar:

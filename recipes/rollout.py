@@ -16,7 +16,7 @@ from ls3_torchrl.data import Tag
 def make_env(config: DictConfig, worlds: int, seed: int, device: torch.device) -> TransformedEnv:
     """The task's environment with ``worlds`` worlds and marks at the starts of episodes."""
     options = {"horizon": config.task.horizon} if "horizon" in config.task else {}
-    return ls3_envs.make(config.task.name, num_worlds=worlds, seed=seed, device=device, **options)
+    return ls3_envs.make(config.task.name, num_envs=worlds, seed=seed, device=device, **options)
 
 
 def collect_demonstrations(config: DictConfig, seed: int) -> dict[Tag, TensorDictBase]:

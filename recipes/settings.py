@@ -89,11 +89,11 @@ def check_settings(config: DictConfig) -> None:
     )
     _positive(config, "optim.batch_size", "optim.lr", "optim.dynamics_lr", "optim.target_interval")
     _positive(config, "loss.dynamics_horizon")
-    _not_negative(config, "loss.failure_weight", "loss.undecided_weight")
+    _not_negative(config, "loss.failure_weight", "loss.timed_out_weight")
     if not 0.0 <= optim.cooldown <= 1.0:
         raise ValueError(f"optim.cooldown must be a share in [0, 1], got {optim.cooldown}.")
-    if not 0.0 <= config.online.share < 1.0:
-        raise ValueError(f"online.share must be a share in [0, 1), got {config.online.share}.")
+    if not 0.0 <= config.online.fraction < 1.0:
+        raise ValueError(f"online.fraction must be a share in [0, 1), got {config.online.fraction}.")
     unknown = set(loss.mean_latents) - set(MEAN_LATENTS)
     if unknown:
         raise ValueError(

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
 from common import RunFolder
-from learning import Learner, Term, wants_bf16
+from learning import AuxiliaryLoss, Learner, wants_bf16
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import ALL_TAGS, VALUE_TAGS, Tag, TaggedReplayBuffer
 from ls3_torchrl.objectives import (
@@ -39,10 +39,14 @@ class Training:
         self.agent, self.buffer, self.config, self.run, self.horizon = agent, buffer, config, run, horizon
         optim, loss = config.optim, config.loss
         batch, interval, bootstrap = optim.batch_size, optim.target_interval, optim.bootstrap
-        self._left_out = None if loss.frozen_dynamics else "frozen"
+        self._left_out = None if loss.frozen_dynamics else "after_violation"
 
         def draw(tags: tuple, members: int | None = None, **options: Any) -> Callable[[], TensorDictBase]:
-            options |= {"tags": tags, "members": members if bootstrap else None, "online_share": config.online.share}
+            options |= {
+                "tags": tags,
+                "members": members if bootstrap else None,
+                "online_fraction": config.online.fraction,
+            }
             return lambda: buffer.sample(batch, **options)
 
         everything = draw(ALL_TAGS)
@@ -74,14 +78,16 @@ class Training:
         )
         failures = None
         if loss.failure_weight > 0.0:
-            failures = Term(loss.failure_weight, OfflineValueLoss(agent.value, bootstrap=bootstrap), self._failures)
+            failures = AuxiliaryLoss(
+                loss.failure_weight, OfflineValueLoss(agent.value, bootstrap=bootstrap), self._failures
+            )
         self.value = Learner(
             "value",
             OfflineValueLoss(agent.value, bootstrap=bootstrap),
             draw(VALUE_TAGS, values),
             lr=optim.lr,
             **how,
-            beside=failures,
+            auxiliary=failures,
         )
         self.value_td = Learner(
             "value",
@@ -126,10 +132,10 @@ class Training:
 
     def _weighed(self, rows: TensorDictBase) -> TensorDictBase:
         """The rows for equation (5); how much those of undecided online episodes count is a setting."""
-        weight = self.config.loss.undecided_weight
+        weight = self.config.loss.timed_out_weight
         if weight != 1.0:
-            undecided = rows["undecided"] & (rows["tag"] == int(Tag.ONLINE))
-            rows.set("safe_set_weight", torch.where(undecided, weight, 1.0))
+            timed_out = rows["timed_out"] & (rows["tag"] == int(Tag.ONLINE))
+            rows.set("safe_set_weight", torch.where(timed_out, weight, 1.0))
         return rows
 
     def train_offline(self) -> None:

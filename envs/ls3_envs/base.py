@@ -26,10 +26,10 @@ class VisualConstraintEnv(EnvBase):
     Episodes always run to the horizon and end by truncation; ``terminated`` is never set. A violation freezes
     the world for the rest of the episode, as in the supplement, section 1.1.2.
 
-    Rows are independent: world ``i`` under seed ``s`` lives the same life whatever ``num_worlds`` is.
+    Rows are independent: world ``i`` under seed ``s`` lives the same life whatever ``num_envs`` is.
 
     Args:
-        num_worlds: how many worlds N are stepped in one call; at least 1.
+        num_envs: how many worlds N are stepped in one call; at least 1.
         state_dim: size of the low-dimensional state.
         action_low: smallest action per axis, in the domain's own units.
         action_high: largest action per axis.
@@ -47,7 +47,7 @@ class VisualConstraintEnv(EnvBase):
     def __init__(
         self,
         *,
-        num_worlds: int,
+        num_envs: int,
         state_dim: int,
         action_low: Sequence[float],
         action_high: Sequence[float],
@@ -56,27 +56,27 @@ class VisualConstraintEnv(EnvBase):
         device: torch.device | str = "cpu",
         seed: int | None = None,
     ) -> None:
-        if num_worlds < 1:
-            raise ValueError(f"num_worlds must be at least 1, got {num_worlds}.")
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}.")
         if horizon < 1:
             raise ValueError(f"horizon must be at least 1 step, got {horizon}.")
-        super().__init__(device=torch.device(device), batch_size=torch.Size([num_worlds]))
-        self.num_worlds = num_worlds
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        self.num_envs = num_envs
         self.horizon = horizon
         self.image_size = image_size
 
         def flag() -> Binary:
-            return Binary(shape=(num_worlds, 1), dtype=torch.bool, device=self.device)
+            return Binary(shape=(num_envs, 1), dtype=torch.bool, device=self.device)
 
         self.observation_spec = Composite(
             pixels=Bounded(
                 low=0,
                 high=255,
-                shape=(num_worlds, 3, image_size, image_size),
+                shape=(num_envs, 3, image_size, image_size),
                 dtype=torch.uint8,
                 device=self.device,
             ),
-            state=Unbounded(shape=(num_worlds, state_dim), device=self.device),
+            state=Unbounded(shape=(num_envs, state_dim), device=self.device),
             constraint=flag(),
             success=flag(),
             shape=self.batch_size,
@@ -85,19 +85,19 @@ class VisualConstraintEnv(EnvBase):
         low = torch.tensor(action_low, dtype=torch.float32, device=self.device)
         high = torch.tensor(action_high, dtype=torch.float32, device=self.device)
         self.action_spec = Bounded(
-            low=low.expand(num_worlds, -1),
-            high=high.expand(num_worlds, -1),
-            shape=(num_worlds, low.shape[0]),
+            low=low.expand(num_envs, -1),
+            high=high.expand(num_envs, -1),
+            shape=(num_envs, low.shape[0]),
             dtype=torch.float32,
             device=self.device,
         )
-        self.reward_spec = Bounded(low=-1.0, high=0.0, shape=(num_worlds, 1), device=self.device)
+        self.reward_spec = Bounded(low=-1.0, high=0.0, shape=(num_envs, 1), device=self.device)
         self.full_done_spec = Composite(
             done=flag(), terminated=flag(), truncated=flag(), shape=self.batch_size, device=self.device
         )
-        self._state = torch.zeros(num_worlds, state_dim, device=self.device)
-        self._frozen = torch.zeros(num_worlds, 1, dtype=torch.bool, device=self.device)
-        self._clock = torch.zeros(num_worlds, dtype=torch.long, device=self.device)
+        self._state = torch.zeros(num_envs, state_dim, device=self.device)
+        self._frozen = torch.zeros(num_envs, 1, dtype=torch.bool, device=self.device)
+        self._clock = torch.zeros(num_envs, dtype=torch.long, device=self.device)
         self._started = False
         self._generators: list[np.random.Generator] = []
         self.set_seed(int(torch.randint(2**31 - 1, ())) if seed is None else seed)
@@ -144,14 +144,12 @@ class VisualConstraintEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         entropy = 0 if seed is None else int(seed)
         self._generators = [
-            np.random.default_rng(np.random.SeedSequence([entropy, world])) for world in range(self.num_worlds)
+            np.random.default_rng(np.random.SeedSequence([entropy, world])) for world in range(self.num_envs)
         ]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        rows = (
-            torch.arange(self.num_worlds) if mask is None else mask.reshape(self.num_worlds).nonzero().flatten().cpu()
-        )
+        rows = torch.arange(self.num_envs) if mask is None else mask.reshape(self.num_envs).nonzero().flatten().cpu()
         for world in rows.tolist():
             self._state[world] = self._initial_state(world, self._generators[world]).to(self._state)
         self._started = True

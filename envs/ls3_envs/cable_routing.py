@@ -86,7 +86,7 @@ class CableRoutingEnv(MujocoEnv):
     The paper's task is physical; this one is simulated: a chain of 16 capsules on hinges, lying on a table that drags.
 
     Args:
-        num_worlds: N.
+        num_envs: N.
         observation: ``"mask"``, the cable's segmentation mask in three equal channels as in the paper, or ``"rgb"``.
         horizon: steps in an episode.
         image_size: side of the image in pixels.
@@ -104,14 +104,14 @@ class CableRoutingEnv(MujocoEnv):
         ValueError: for an unknown ``observation``, and as the base classes do.
 
     Example:
-        >>> env = CableRoutingEnv(num_worlds=2, seed=0)
+        >>> env = CableRoutingEnv(num_envs=2, seed=0)
         >>> env.rollout(3)["next", "pixels"].shape
         torch.Size([2, 3, 3, 64, 64])
     """
 
     def __init__(
         self,
-        num_worlds: int = 1,
+        num_envs: int = 1,
         *,
         observation: Observation = "mask",
         horizon: int = HORIZON,
@@ -128,7 +128,7 @@ class CableRoutingEnv(MujocoEnv):
         super().__init__(
             cable_model(),
             "above",
-            num_worlds=num_worlds,
+            num_envs=num_envs,
             action_low=(-MAX_STEP, -MAX_STEP),
             action_high=(MAX_STEP, MAX_STEP),
             horizon=horizon,

@@ -33,10 +33,10 @@ def _images(pixels: Tensor) -> np.ndarray:
 class _Worlds:
     """Worlds of a domain, with the spaces of one."""
 
-    def __init__(self, domain: str, num_worlds: int, render_mode: str | None, options: dict[str, Any]) -> None:
+    def __init__(self, domain: str, num_envs: int, render_mode: str | None, options: dict[str, Any]) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}.")
-        self.env = make(domain, num_worlds, **options)
+        self.env = make(domain, num_envs, **options)
         pixels, action = self.env.observation_spec["pixels"], self.env.action_spec.space
         channels, height, width = pixels.shape[-3:]
         self.observation_space = spaces.Box(0, 255, (height, width, channels), np.uint8)

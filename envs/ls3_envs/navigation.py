@@ -37,7 +37,7 @@ class NavigationEnv(VisualConstraintEnv):
     cannot be told from a picture.
 
     Args:
-        num_worlds: number N of worlds stepped together.
+        num_envs: number N of worlds stepped together.
         start: ``"fixed"`` for the paper's start, ``"random"`` for anywhere outside the wall.
         horizon: steps in an episode.
         device: CPU or CUDA device of states and images.
@@ -51,7 +51,7 @@ class NavigationEnv(VisualConstraintEnv):
         ValueError: for an unknown ``start``, and as the base class does.
 
     Example:
-        >>> env = NavigationEnv(num_worlds=2, seed=0)
+        >>> env = NavigationEnv(num_envs=2, seed=0)
         >>> episode = env.rollout(100)
         >>> episode["next", "pixels"].shape
         torch.Size([2, 100, 3, 64, 64])
@@ -59,7 +59,7 @@ class NavigationEnv(VisualConstraintEnv):
 
     def __init__(
         self,
-        num_worlds: int = 1,
+        num_envs: int = 1,
         *,
         start: Literal["fixed", "random"] = "fixed",
         horizon: int = HORIZON,
@@ -69,7 +69,7 @@ class NavigationEnv(VisualConstraintEnv):
         if start not in ("fixed", "random"):
             raise ValueError(f"start must be 'fixed' or 'random', got {start!r}.")
         super().__init__(
-            num_worlds=num_worlds,
+            num_envs=num_envs,
             state_dim=2,
             action_low=(-MAX_STEP, -MAX_STEP),
             action_high=(MAX_STEP, MAX_STEP),
@@ -79,7 +79,7 @@ class NavigationEnv(VisualConstraintEnv):
         )
         self.start = start
         # An episode's noise is drawn at reset from the world's own stream: rows stay independent, steps stay fast.
-        self._noise = torch.zeros(num_worlds, horizon, 2, device=self.device)
+        self._noise = torch.zeros(num_envs, horizon, 2, device=self.device)
         centre = (torch.arange(self.image_size, device=self.device) + 0.5) / self.image_size
         self._pixel_x, self._pixel_y = centre * WINDOW[0], centre * WINDOW[1]
         self._background = self._draw_background()
@@ -103,7 +103,7 @@ class NavigationEnv(VisualConstraintEnv):
 
     def _advance(self, state: Tensor, action: Tensor) -> Tensor:
         step = self._clock.clamp(max=self.horizon - 1)
-        noise = self._noise[torch.arange(self.num_worlds, device=self.device), step]
+        noise = self._noise[torch.arange(self.num_envs, device=self.device), step]
         return (state + action + noise).clamp(min=0.0).minimum(state.new_tensor(WINDOW))
 
     def _violates(self, state: Tensor) -> Tensor:

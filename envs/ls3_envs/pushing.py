@@ -114,7 +114,7 @@ class SequentialPushingEnv(MujocoEnv):
     substeps of 5 ms instead of 500: the end poses agree within 0.6 mm.
 
     Args:
-        num_worlds: N.
+        num_envs: N.
         hand: ``"gripper"``, 8 cm wide and flat: a block that it hits off its middle still goes straight on; or
             ``"peg"``, round and 3.6 cm wide: such a block turns and slips away.
         start: ``"fixed"`` has the hand in front of the blocks, with noise of 3 mm; ``"random"`` anywhere in front of
@@ -135,14 +135,14 @@ class SequentialPushingEnv(MujocoEnv):
         ValueError: for an unknown ``start`` or ``hand``, and as the base classes do.
 
     Example:
-        >>> env = SequentialPushingEnv(num_worlds=2, seed=0)
+        >>> env = SequentialPushingEnv(num_envs=2, seed=0)
         >>> env.rollout(3)["next", "pixels"].shape
         torch.Size([2, 3, 3, 64, 64])
     """
 
     def __init__(
         self,
-        num_worlds: int = 1,
+        num_envs: int = 1,
         *,
         hand: HandName = "gripper",
         start: Literal["fixed", "random"] = "fixed",
@@ -162,7 +162,7 @@ class SequentialPushingEnv(MujocoEnv):
         super().__init__(
             pushing_model(hand),
             "above",
-            num_worlds=num_worlds,
+            num_envs=num_envs,
             action_low=(-MAX_STEP, -MAX_STEP),
             action_high=(MAX_STEP, MAX_STEP),
             horizon=horizon,

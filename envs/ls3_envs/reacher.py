@@ -74,7 +74,7 @@ class ReacherEnv(MujocoEnv):
     disc.
 
     Args:
-        num_worlds: N.
+        num_envs: N.
         start: ``"fixed"`` for the paper's start, ``"random"`` for anywhere at rest.
         horizon: steps in an episode.
         image_size: side of the image in pixels.
@@ -92,14 +92,14 @@ class ReacherEnv(MujocoEnv):
         ValueError: for an unknown ``start``, and as the base classes do.
 
     Example:
-        >>> env = ReacherEnv(num_worlds=2, seed=0)
+        >>> env = ReacherEnv(num_envs=2, seed=0)
         >>> env.rollout(3)["next", "pixels"].shape
         torch.Size([2, 3, 3, 64, 64])
     """
 
     def __init__(
         self,
-        num_worlds: int = 1,
+        num_envs: int = 1,
         *,
         start: Literal["fixed", "random"] = "fixed",
         horizon: int = HORIZON,
@@ -116,7 +116,7 @@ class ReacherEnv(MujocoEnv):
         super().__init__(
             reacher_model(),
             "fixed",
-            num_worlds=num_worlds,
+            num_envs=num_envs,
             action_low=(-1.0, -1.0),
             action_high=(1.0, 1.0),
             horizon=horizon,

@@ -37,7 +37,7 @@ class Domain:
     """A row of the table.
 
     Args:
-        env: the environment's class; called with ``num_worlds``, ``seed``, ``device`` and options.
+        env: the environment's class; called with ``num_envs``, ``seed``, ``device`` and options.
         offline: the offline data by the paper's names ``success``, ``rand`` and ``constraint``.
         frames: pictures that are stacked into one observation, where one alone does not show velocities.
         frame_stride: steps between them; what moves less than a pixel a step is seen to move over several.
@@ -113,13 +113,13 @@ def _stack(frames: int, stride: int) -> list[Transform]:
 
 
 def make(
-    name: str, num_worlds: int = 1, *, frames: int | None = None, frame_stride: int | None = None, **options: Any
+    name: str, num_envs: int = 1, *, frames: int | None = None, frame_stride: int | None = None, **options: Any
 ) -> TransformedEnv:
-    """The domain ``name`` with ``num_worlds`` worlds, marks at the starts of episodes, and frames stacked.
+    """The domain ``name`` with ``num_envs`` worlds, marks at the starts of episodes, and frames stacked.
 
     Args:
         name: of the domain.
-        num_worlds: N.
+        num_envs: N.
         frames: pictures stacked along the channels into ``pixels``, the newest last; the domain's number when ``None``.
         frame_stride: steps between them; the domain's when ``None``. Before there are as many, the first one repeats.
         options: of the environment; see its class.
@@ -128,7 +128,7 @@ def make(
         ValueError: for an unknown domain, fewer than one frame or a stride below one step.
 
     Example:
-        >>> make("navigation", num_worlds=3, seed=0).batch_size
+        >>> make("navigation", num_envs=3, seed=0).batch_size
         torch.Size([3])
     """
     row = domain(name)
@@ -137,7 +137,7 @@ def make(
     for what, number in (("frames", frames), ("frame_stride", stride)):
         if number < 1:
             raise ValueError(f"{what} must be at least 1, got {number}.")
-    return TransformedEnv(row.env(num_worlds=num_worlds, **options), Compose(*_stack(frames, stride), InitTracker()))
+    return TransformedEnv(row.env(num_envs=num_envs, **options), Compose(*_stack(frames, stride), InitTracker()))
 
 
 def collect_offline(
@@ -174,6 +174,6 @@ def collect_offline(
         part = min(_SIDE_BY_SIDE, count - first)
         # Streams of their own; those of the first part do not depend on how many parts there are.
         own = seed + 7_919 * first
-        env = make(name, num_worlds=part, seed=own, device=device, **recipe.env_options)
+        env = make(name, num_envs=part, seed=own, device=device, **recipe.env_options)
         parts.append(by.collect_episodes(env, recipe.policy(seed=own)))
     return torch.cat(parts) if len(parts) > 1 else parts[0]

@@ -3,7 +3,14 @@
 from ls3_torchrl.data.augment import random_perspective, random_resized_crop
 from ls3_torchrl.data.buffer import TaggedReplayBuffer
 from ls3_torchrl.data.dataset import check_episodes, load_episodes, save_episodes
-from ls3_torchrl.data.labels import failure_tail, frozen, in_success, reward_to_go, undecided, without_idle_end
+from ls3_torchrl.data.labels import (
+    after_violation,
+    failure_tail,
+    in_success,
+    length_without_idle_end,
+    reward_to_go,
+    timed_out,
+)
 from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.tags import ALL_TAGS, VALUE_TAGS, Tag
 
@@ -13,15 +20,15 @@ __all__ = [
     "Tag",
     "TagSampler",
     "TaggedReplayBuffer",
+    "after_violation",
     "check_episodes",
     "failure_tail",
-    "frozen",
     "in_success",
+    "length_without_idle_end",
     "load_episodes",
     "random_perspective",
     "random_resized_crop",
     "reward_to_go",
     "save_episodes",
-    "undecided",
-    "without_idle_end",
+    "timed_out",
 ]

@@ -17,7 +17,14 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from ls3_torchrl._checks import require_at_least, require_finite, require_keys
-from ls3_torchrl.data.labels import failure_tail, frozen, in_success, reward_to_go, undecided, without_idle_end
+from ls3_torchrl.data.labels import (
+    after_violation,
+    failure_tail,
+    in_success,
+    length_without_idle_end,
+    reward_to_go,
+    timed_out,
+)
 from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.tags import ALL_TAGS, Tag
 from ls3_torchrl.modules.vae import PixelEncoder
@@ -124,7 +131,7 @@ class TaggedReplayBuffer:
 
     def _add_one(self, episode: TensorDictBase, tag: Tag) -> None:
         if self.success_tail is not None:
-            episode = episode[: without_idle_end(episode["next", "success"], self.success_tail)]
+            episode = episode[: length_without_idle_end(episode["next", "success"], self.success_tail)]
         steps = episode.shape[0]
         if steps + 1 > self.pixel_capacity or steps > self.capacity:
             raise ValueError(
@@ -144,8 +151,8 @@ class TaggedReplayBuffer:
                 "action": episode["action"],
                 "tag": torch.full((steps, 1), int(tag), dtype=torch.uint8),
                 "in_success": in_success(success),
-                "frozen": frozen(episode["next", "constraint"]),
-                "undecided": undecided(success, episode["next", "constraint"]),
+                "after_violation": after_violation(episode["next", "constraint"]),
+                "timed_out": timed_out(success, episode["next", "constraint"]),
                 "reward_to_go": reward_to_go(reward, self.gamma, tail),
                 "frame": first + torch.arange(steps).unsqueeze(-1),
                 "steps_left": torch.arange(steps, 0, -1).unsqueeze(-1),
@@ -224,21 +231,21 @@ class TaggedReplayBuffer:
         *,
         without: NestedKey | None = None,
         steps: int = 1,
-        online_share: float = 0.0,
+        online_fraction: float = 0.0,
     ) -> TensorDictReplayBuffer:
         """A TorchRL buffer on the same latent store that samples from the union of ``tags``.
 
         Args:
             tags: what to draw from.
-            without: label whose rows are left out, such as ``"frozen"``.
+            without: label whose rows are left out, such as ``"after_violation"``.
             steps: only rows that so many steps of their episode begin with.
-            online_share: least share of online rows in a draw; see :class:`~ls3_torchrl.data.TagSampler`.
+            online_fraction: least share of online rows in a draw; see :class:`~ls3_torchrl.data.TagSampler`.
         """
-        key = (tuple(sorted({Tag.parse(tag) for tag in tags})), without, steps, online_share)
+        key = (tuple(sorted({Tag.parse(tag) for tag in tags})), without, steps, online_fraction)
         if key not in self._views:
             self._views[key] = TensorDictReplayBuffer(
                 storage=self.latents.storage,
-                sampler=TagSampler(key[0], without=without, steps=steps, online_share=online_share),
+                sampler=TagSampler(key[0], without=without, steps=steps, online_fraction=online_fraction),
                 writer=ImmutableDatasetWriter(),
             )
         return self._views[key]
@@ -257,7 +264,7 @@ class TaggedReplayBuffer:
         without: NestedKey | None = None,
         steps: int | None = None,
         pixels: bool = False,
-        online_share: float = 0.0,
+        online_fraction: float = 0.0,
     ) -> TensorDictBase:
         """Transitions with freshly drawn latents, uniformly from the union of the tags where no share is asked for.
 
@@ -265,10 +272,10 @@ class TaggedReplayBuffer:
             batch_size: B.
             tags: what to draw from.
             members: M for a bootstrap: B transitions drawn independently for each of M members.
-            without: label whose rows are left out, such as ``"frozen"``.
+            without: label whose rows are left out, such as ``"after_violation"``.
             steps: K for stretches of K transitions of one episode, in their order.
             pixels: add ``pixels`` and ``("next", "pixels")``; then no encoder is needed, and latents are zero without.
-            online_share: least share of online transitions; see :class:`~ls3_torchrl.data.TagSampler`.
+            online_fraction: least share of online transitions; see :class:`~ls3_torchrl.data.TagSampler`.
 
         Returns:
             ``[B]``, or ``[B, M]``, or either with K behind, with ``latent`` and ``("next", "latent")`` drawn from the
@@ -277,7 +284,7 @@ class TaggedReplayBuffer:
         if self._encoder is None and not pixels:
             raise RuntimeError("The buffer has no latents yet: call buffer.encode(encoder) after training the VAE.")
         count = batch_size * (members or 1)
-        rows = self._stretches(count, tags, without, steps or 1, online_share)[1]
+        rows = self._stretches(count, tags, without, steps or 1, online_fraction)[1]
         if pixels:
             for group, slot in zip((rows, rows.get("next")), self._slots(rows["frame"]), strict=True):
                 group.set("pixels", self.pixels.storage[slot]["pixels"])
@@ -294,10 +301,10 @@ class TaggedReplayBuffer:
         tags: Iterable[Tag | str],
         without: NestedKey | None,
         steps: int,
-        online_share: float = 0.0,
+        online_fraction: float = 0.0,
     ) -> tuple[TensorDictBase, TensorDictBase]:
         """The first rows ``[count]`` of stretches of one episode each, and all of their rows ``[count * steps]``."""
-        view = self.view(tags, without=without, steps=steps, online_share=online_share)
+        view = self.view(tags, without=without, steps=steps, online_fraction=online_fraction)
         first = view.sample(count)
         if steps == 1:
             return first, first

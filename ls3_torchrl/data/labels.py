@@ -58,7 +58,7 @@ def failure_tail(reward: Tensor, success: Tensor, gamma: float) -> Tensor:
     return torch.where(success.any(-2), torch.zeros_like(endless), endless)
 
 
-def undecided(success: Tensor, constraint: Tensor) -> Tensor:
+def timed_out(success: Tensor, constraint: Tensor) -> Tensor:
     """Whether a trajectory neither reaches the goal nor violates a constraint: it tells of no state that it is unsafe.
 
     Args:
@@ -70,14 +70,14 @@ def undecided(success: Tensor, constraint: Tensor) -> Tensor:
 
     Example:
         >>> never, late = torch.zeros(3, 1, dtype=torch.bool), torch.tensor([[False], [False], [True]])
-        >>> undecided(never, never).flatten().tolist(), undecided(never, late).flatten().tolist()
+        >>> timed_out(never, never).flatten().tolist(), timed_out(never, late).flatten().tolist()
         ([True, True, True], [False, False, False])
     """
     decided = success.any(-2, keepdim=True) | constraint.any(-2, keepdim=True)
     return (~decided).expand_as(success)
 
 
-def frozen(constraint: Tensor) -> Tensor:
+def after_violation(constraint: Tensor) -> Tensor:
     """Whether a violation has frozen the world before the step: its action moves nothing.
 
     Args:
@@ -87,7 +87,7 @@ def frozen(constraint: Tensor) -> Tensor:
         bool ``[*B, T, 1]``.
 
     Example:
-        >>> frozen(torch.tensor([[False], [True], [True]])).flatten().tolist()
+        >>> after_violation(torch.tensor([[False], [True], [True]])).flatten().tolist()
         [False, False, True]
     """
     violated = constraint.to(torch.uint8).cummax(dim=-2).values.bool()
@@ -111,7 +111,7 @@ def in_success(success: Tensor) -> Tensor:
     return reversed_success.cummax(dim=-2).values.flip(-2).bool()
 
 
-def without_idle_end(success: Tensor, tail: int) -> int:
+def length_without_idle_end(success: Tensor, tail: int) -> int:
     """How many steps of a trajectory are left when only ``tail`` of the successes that it ends with are kept.
 
     Args:
@@ -120,7 +120,7 @@ def without_idle_end(success: Tensor, tail: int) -> int:
 
     Example:
         >>> done = torch.tensor([[True], [False], [True], [True], [True]])
-        >>> without_idle_end(done, tail=1), without_idle_end(done, tail=9)
+        >>> length_without_idle_end(done, tail=1), length_without_idle_end(done, tail=9)
         (3, 5)
     """
     steps = len(success)

@@ -27,7 +27,7 @@ class TagSampler(Sampler):
         without: where the rows say, bool ``[1]``, whether they are left out; none is when ``None``.
         steps: rows are drawn that begin a stretch of so many steps of one episode, none of which is left out.
         steps_left_key: where the rows keep how many steps their episode has from them on, int64 ``[1]``.
-        online_share: least share of online rows in a draw, in [0, 1), once there are some. Where offline data are many,
+        online_fraction: least share of online rows in a draw, in [0, 1), once there are some. Where offline data are many,
             a uniform draw hardly shows what the agent itself has met.
 
     Raises:
@@ -54,15 +54,15 @@ class TagSampler(Sampler):
         without: NestedKey | None = None,
         steps: int = 1,
         steps_left_key: NestedKey = "steps_left",
-        online_share: float = 0.0,
+        online_fraction: float = 0.0,
     ) -> None:
         super().__init__()
         self.tags = tuple(sorted({Tag.parse(tag) for tag in tags}))
         if not self.tags:
             raise ValueError("A TagSampler needs at least one tag; none was given.")
-        if not 0.0 <= online_share < 1.0:
-            raise ValueError(f"online_share must be in [0, 1), got {online_share}.")
-        self.online_share = online_share
+        if not 0.0 <= online_fraction < 1.0:
+            raise ValueError(f"online_fraction must be in [0, 1), got {online_fraction}.")
+        self.online_fraction = online_fraction
         self.tag_key, self.without = tag_key, without
         self.steps, self.steps_left_key = require_at_least(steps, 1, "steps"), steps_left_key
         self._rows: Tensor | None = None
@@ -96,7 +96,7 @@ class TagSampler(Sampler):
         if self._cached_parts is None:
             rows = self.rows(storage)
             online = storage[:].get(self.tag_key).flatten()[rows] == int(Tag.ONLINE)
-            too_few = 0.0 < online.float().mean() < self.online_share
+            too_few = 0.0 < online.float().mean() < self.online_fraction
             self._cached_parts = [rows[~online], rows[online]] if too_few else [rows]
         return self._cached_parts
 
@@ -110,7 +110,7 @@ class TagSampler(Sampler):
                 "Collect such episodes and add them with that tag before training what learns from them."
             )
         parts = self._parts(storage)
-        online = round(self.online_share * batch_size) if len(parts) == 2 else 0
+        online = round(self.online_fraction * batch_size) if len(parts) == 2 else 0
         drawn = [
             part[torch.randint(part.numel(), (count,), device=part.device)]
             for part, count in zip(parts, (batch_size - online, online), strict=False)

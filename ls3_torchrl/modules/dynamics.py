@@ -141,7 +141,7 @@ class EnsembleDynamics(TensorDictModuleBase):
         delta, log_scale = self.read_output(output, action)
         return latent + delta, log_scale.exp()
 
-    def carry(self, latent: Tensor, actions: Tensor, *, per_member: bool = False) -> tuple[Tensor, Tensor]:
+    def unroll(self, latent: Tensor, actions: Tensor, *, per_member: bool = False) -> tuple[Tensor, Tensor]:
         """Every member's mean and standard deviation over K steps, each member carrying its own mean on.
 
         Args:

@@ -10,7 +10,7 @@ from torchrl.objectives import LossModule
 
 from ls3_torchrl._checks import require_keys
 from ls3_torchrl.modules.classifiers import LatentClassifier
-from ls3_torchrl.objectives._evaluate import as_scalars, evaluate
+from ls3_torchrl.objectives._call import as_scalars, call_on_latent
 
 
 class ClassifierLoss(LossModule):
@@ -76,7 +76,7 @@ class ClassifierLoss(LossModule):
         keys = self.tensor_keys
         require_keys(tensordict, self.in_keys, "ClassifierLoss")
         label = tensordict.get(keys.label)
-        logit = evaluate(self.classifier, tensordict.get(keys.latent))
+        logit = call_on_latent(self.classifier, tensordict.get(keys.latent))
         hits = ((logit.detach() > 0) == label.bool()).float()
         return as_scalars(
             **{

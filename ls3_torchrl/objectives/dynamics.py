@@ -10,7 +10,7 @@ from torchrl.objectives import LossModule
 
 from ls3_torchrl._checks import require_at_least, require_keys
 from ls3_torchrl.modules.dynamics import EnsembleDynamics
-from ls3_torchrl.objectives._evaluate import as_scalars, check_members
+from ls3_torchrl.objectives._call import as_scalars, check_members
 
 
 class EnsembleDynamicsLoss(LossModule):
@@ -95,7 +95,7 @@ class EnsembleDynamicsLoss(LossModule):
             check_members(first, self.dynamics.num_members, "EnsembleDynamicsLoss")
         else:
             target = target.unsqueeze(-2 if self.steps == 1 else -3)
-        predict = self.dynamics.distribution if self.steps == 1 else self.dynamics.carry
+        predict = self.dynamics.distribution if self.steps == 1 else self.dynamics.unroll
         loc, scale = predict(first, action, per_member=self.bootstrap)
         target = target.expand_as(loc)
         return as_scalars(

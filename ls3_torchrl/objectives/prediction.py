@@ -11,7 +11,7 @@ from torchrl.objectives import LossModule
 from ls3_torchrl._checks import require_keys
 from ls3_torchrl.modules.dynamics import EnsembleDynamics
 from ls3_torchrl.modules.vae import PixelEncoder
-from ls3_torchrl.objectives._evaluate import as_scalars
+from ls3_torchrl.objectives._call import as_scalars
 
 
 class LatentPredictionLoss(LossModule):
@@ -95,5 +95,5 @@ class LatentPredictionLoss(LossModule):
         actions = tensordict.get(keys.action)
         if actions.ndim == latent.ndim:
             actions = actions.unsqueeze(-2)
-        predicted = self.dynamics.carry(latent, actions)[0][..., -1, :]
+        predicted = self.dynamics.unroll(latent, actions)[0][..., -1, :]
         return as_scalars(loss_prediction=(predicted - next_latent.unsqueeze(-2)).square().mean())

@@ -13,7 +13,7 @@ from torchrl.objectives import LossModule
 
 from ls3_torchrl._checks import require_keys
 from ls3_torchrl.modules.classifiers import SafeSet
-from ls3_torchrl.objectives._evaluate import as_scalars, evaluate
+from ls3_torchrl.objectives._call import as_scalars, call_on_latent
 from ls3_torchrl.objectives.value import check_discount
 
 
@@ -90,7 +90,7 @@ class SafeSetLoss(LossModule):
     def target(self, next_latent: Tensor, in_success: Tensor) -> Tensor:
         """max(1_S(z_t), γ_S f_S'(z_{t+1})), a probability ``[B, 1]``."""
         with torch.no_grad():
-            next_safe = evaluate(self.safe_set, next_latent, params=self.target_safe_set_params).sigmoid()
+            next_safe = call_on_latent(self.safe_set, next_latent, params=self.target_safe_set_params).sigmoid()
         return torch.maximum(in_success.to(next_safe), self.gamma * next_safe)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -99,5 +99,5 @@ class SafeSetLoss(LossModule):
         require_keys(tensordict, self.in_keys, "SafeSetLoss")
         target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.in_success))
         weight = tensordict.get(keys.weight, None)
-        logit = evaluate(self.safe_set, tensordict.get(keys.latent), params=self.safe_set_params)
+        logit = call_on_latent(self.safe_set, tensordict.get(keys.latent), params=self.safe_set_params)
         return as_scalars(loss_safe_set=binary_cross_entropy_with_logits(logit, target, weight))

@@ -13,7 +13,7 @@ from torchrl.objectives.value.functional import td0_return_estimate
 
 from ls3_torchrl._checks import require_keys
 from ls3_torchrl.modules.value import ValueEnsemble
-from ls3_torchrl.objectives._evaluate import as_scalars, check_members, evaluate
+from ls3_torchrl.objectives._call import as_scalars, call_on_latent, check_members
 
 
 def check_discount(gamma: float, name: str = "gamma") -> float:
@@ -90,7 +90,7 @@ class OfflineValueLoss(LossModule):
             check_members(latent, self.value.num_members, "OfflineValueLoss")
         else:
             target = target.unsqueeze(-2)
-        value = evaluate(self.value, latent, per_member=self.bootstrap)
+        value = call_on_latent(self.value, latent, per_member=self.bootstrap)
         return as_scalars(loss_value=(value - target).square().mean())
 
 
@@ -186,7 +186,9 @@ class TD1ValueLoss(LossModule):
     def target(self, next_latent: Tensor, reward: Tensor) -> Tensor:
         """r_t + γ V_θ'(z_{t+1}) of every member, ``[B, M, 1]``."""
         with torch.no_grad():
-            next_value = evaluate(self.value, next_latent, params=self.target_value_params, per_member=self.bootstrap)
+            next_value = call_on_latent(
+                self.value, next_latent, params=self.target_value_params, per_member=self.bootstrap
+            )
         reward = reward if self.bootstrap else reward.unsqueeze(-2)
         reward = reward.expand_as(next_value)
         never = torch.zeros_like(reward, dtype=torch.bool)
@@ -204,5 +206,5 @@ class TD1ValueLoss(LossModule):
         if self.monte_carlo:
             seen = tensordict.get(keys.reward_to_go)
             target = torch.maximum(target, seen if self.bootstrap else seen.unsqueeze(-2))
-        value = evaluate(self.value, latent, params=self.value_params, per_member=self.bootstrap)
+        value = call_on_latent(self.value, latent, params=self.value_params, per_member=self.bootstrap)
         return as_scalars(loss_value=(value - target).square().mean())

@@ -1,6 +1,6 @@
 """Planning: the learned model as an environment, the optimiser, the scores, and LS³'s controller."""
 
-from ls3_torchrl.planners.cem import CEMResult, CrossEntropyMethod, Judgement
+from ls3_torchrl.planners.cem import CEMResult, CrossEntropyMethod, PlanScores
 from ls3_torchrl.planners.fused import FusedImagination
 from ls3_torchrl.planners.imagination import ImaginationNoise, Limits, PlanNoise, RolloutImagination
 from ls3_torchrl.planners.latent_env import LatentEnv
@@ -13,11 +13,11 @@ __all__ = [
     "CrossEntropyMethod",
     "FusedImagination",
     "ImaginationNoise",
-    "Judgement",
     "LS3Planner",
     "LatentEnv",
     "Limits",
     "PlanNoise",
+    "PlanScores",
     "PlanStatistics",
     "RolloutImagination",
     "WarmStart",

@@ -11,8 +11,8 @@ from torch import Tensor
 from ls3_torchrl._checks import require_at_least
 
 
-class Judgement(NamedTuple):
-    """What the caller says of a population of b × N sequences, each field ``[b, N]``.
+class PlanScores(NamedTuple):
+    """What the caller says of a iteration of b × N sequences, each field ``[b, N]``.
 
     Attributes:
         score: the objective; NaN ranks last.
@@ -25,14 +25,14 @@ class Judgement(NamedTuple):
     fallback: Tensor
 
 
-class Evaluate(Protocol):
+class ScorePlans(Protocol):
     """Judges candidate sequences."""
 
-    def __call__(self, actions: Tensor, rows: Tensor, restarts: Tensor, population: int) -> Judgement:
+    def __call__(self, actions: Tensor, rows: Tensor, restarts: Tensor, iteration: int) -> PlanScores:
         """Judge ``actions`` ``[b, N, H, A]`` of batch rows ``rows`` ``[b]``, restarted ``restarts`` ``[b]`` times."""
 
 
-#: Draws the noise of one population: (rows ``[b]``, population) -> standard normal and uniform in [0, 1), each
+#: Draws the noise of one iteration: (rows ``[b]``, iteration) -> standard normal and uniform in [0, 1), each
 #: ``[b, N, H, A]``; the uniform one covers the first ``num_random + num_constant`` candidates at least.
 CandidateNoise = Callable[[Tensor, int], tuple[Tensor, Tensor]]
 
@@ -47,7 +47,7 @@ class CEMResult(NamedTuple):
         std: their standard deviation, ``[B, H, A]``.
         restarts: how often each row started again, int64 ``[B]``.
         fallback: bool ``[B]``, nothing feasible was ever found.
-        populations: how many populations each row had scored, int64 ``[B]``.
+        iterations: how many iterations each row had scored, int64 ``[B]``.
     """
 
     actions: Tensor
@@ -56,7 +56,7 @@ class CEMResult(NamedTuple):
     std: Tensor
     restarts: Tensor
     fallback: Tensor
-    populations: Tensor
+    iterations: Tensor
 
 
 class CrossEntropyMethod:
@@ -66,7 +66,7 @@ class CrossEntropyMethod:
     uniform action, and the rest come from the given Gaussian; later rounds sample the refitted one, clamped to
     the box. A row in which nothing is feasible starts again from its first round, up to ``max_restarts`` times;
     after that it takes the sequence with the best fallback ranking (unless an earlier round had found a feasible
-    one). The outcome is the best sequence that was scored: no population is drawn without being scored.
+    one). The outcome is the best sequence that was scored: no iteration is drawn without being scored.
 
     Args:
         num_candidates: N.
@@ -85,9 +85,9 @@ class CrossEntropyMethod:
     Example:
         >>> import torch
         >>> low, high = torch.tensor([-1.0]), torch.tensor([2.0])
-        >>> def quadratic(actions, rows, restarts, population):
+        >>> def quadratic(actions, rows, restarts, iteration):
         ...     score = -(actions - 0.5).square().sum((-1, -2))
-        ...     return Judgement(score, torch.ones_like(score, dtype=torch.bool), score)
+        ...     return PlanScores(score, torch.ones_like(score, dtype=torch.bool), score)
         >>> cem = CrossEntropyMethod(num_candidates=500, num_elites=20, optim_steps=8)
         >>> result = cem(quadratic, low, high, batch=1, horizon=3)
         >>> bool((result.actions - 0.5).abs().max() < 0.05)
@@ -135,8 +135,8 @@ class CrossEntropyMethod:
         return min(round(self.p_constant * self.num_candidates), self.num_candidates - self.num_random)
 
     @property
-    def max_populations(self) -> int:
-        """The most populations that a row can score."""
+    def max_iterations(self) -> int:
+        """The most iterations that a row can score."""
         return self.optim_steps * (self.max_restarts + 1)
 
     def draw(self, rows: Tensor, horizon: int, action_dim: int) -> tuple[Tensor, Tensor]:
@@ -146,7 +146,7 @@ class CrossEntropyMethod:
 
     def __call__(
         self,
-        evaluate: Evaluate,
+        score_plans: ScorePlans,
         low: Tensor,
         high: Tensor,
         *,
@@ -159,7 +159,7 @@ class CrossEntropyMethod:
         """Optimise ``batch`` sequences of ``horizon`` actions in the box.
 
         Args:
-            evaluate: judges candidates.
+            score_plans: judges candidates.
             low: lower bounds ``[A]``.
             high: upper bounds ``[A]``.
             batch: B.
@@ -176,16 +176,16 @@ class CrossEntropyMethod:
         best = torch.zeros(shape, device=device)
         best_score = torch.full((batch,), -torch.inf, device=device)
         step = torch.zeros(batch, dtype=torch.long, device=device)
-        restarts, populations = torch.zeros_like(step), torch.zeros_like(step)
+        restarts, iterations = torch.zeros_like(step), torch.zeros_like(step)
         found = torch.zeros(batch, dtype=torch.bool, device=device)
         index = torch.arange(self.num_candidates, device=device)
         uniform_first = index < self.num_random + self.num_constant
         constant = (uniform_first & (index >= self.num_random))[:, None, None]
 
         rows = torch.arange(batch, device=device)
-        population = 0
+        iteration = 0
         while rows.numel():
-            normal, uniform = self.draw(rows, horizon, shape[-1]) if noise is None else noise(rows, population)
+            normal, uniform = self.draw(rows, horizon, shape[-1]) if noise is None else noise(rows, iteration)
             actions = mean[rows, None] + std[rows, None] * normal
             if self.num_constant:
                 uniform = torch.where(constant, uniform[..., :1, :], uniform)
@@ -193,8 +193,8 @@ class CrossEntropyMethod:
             actions = torch.where(is_uniform[..., None, None], low + side * uniform, actions)
             actions = actions.clamp(low, high)
 
-            score, allowed, fallback = evaluate(actions, rows, restarts[rows], population)
-            populations[rows] += 1
+            score, allowed, fallback = score_plans(actions, rows, restarts[rows], iteration)
+            iterations[rows] += 1
             allowed = allowed & (score > -torch.inf)  # False for NaN too
             score = score.masked_fill(~allowed, -torch.inf)
             elite_score, elite = score.topk(self.num_elites, dim=-1)
@@ -230,5 +230,5 @@ class CrossEntropyMethod:
                 best_score[lost] = harm.gather(-1, choice[:, None]).squeeze(-1)
                 mean[lost], std[lost] = best[lost], start_std[lost]
             rows = rows[step[rows] < self.optim_steps]
-            population += 1
-        return CEMResult(best, best_score, mean, std, restarts, ~found, populations)
+            iteration += 1
+        return CEMResult(best, best_score, mean, std, restarts, ~found, iterations)

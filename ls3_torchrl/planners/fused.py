@@ -118,7 +118,7 @@ class FusedImagination:
         self.compiled = compiled
         self._compiled_plans: int | None = None  # plans in a block that is worth compiling
         self._seen: list[Tensor] = []
-        self._steady = False
+        self._parameters_fixed = False
         self._members: list[Layers] = []  # the dynamics, one member after another
         self._stacked: Layers = []  # the dynamics in weights [M, in, out] and biases [M, 1, out]
         self._value: list[Layers] = []
@@ -163,14 +163,14 @@ class FusedImagination:
         return True
 
     @contextmanager
-    def steady(self) -> Iterator[None]:
+    def parameters_fixed(self) -> Iterator[None]:
         """Look for changed parameters now, and not again before the end: for several calls in a row, as in one plan."""
         self.refresh()
-        self._steady = True
+        self._parameters_fixed = True
         try:
             yield
         finally:
-            self._steady = False
+            self._parameters_fixed = False
 
     @torch.no_grad()
     def __call__(
@@ -181,7 +181,7 @@ class FusedImagination:
         With ``limits``, plans that are not feasible under them get neither values nor goal probabilities (NaN): the
         planner masks their scores anyway, and most plans of a first round are not.
         """
-        if not self._steady:
+        if not self._parameters_fixed:
             self.refresh()
         b, n, horizon, _ = actions.shape
         particles, plans = noise.members.shape[1], b * n
@@ -240,7 +240,7 @@ class FusedImagination:
         """Statistics of the plans ``[H, R, A]`` from latents ``[R or 1, D]`` under noise ``[H, P, R or 1, D]``."""
         horizon, r, _ = plan.shape
         particles = noise.shape[1]
-        path = self._carry(latent, plan, members, groups, noise)
+        path = self._unroll(latent, plan, members, groups, noise)
         violating = torch.stack([self._probability("constraint", states) for states in path], -1)  # [P, R, H]
         constraint = violating.amax(0) if self.constraint_reduction == "max" else violating.mean(0)
         in_safe_set = self._probability("safe_set", path[-1])
@@ -270,7 +270,7 @@ class FusedImagination:
         logit = run_layers(states.reshape(-1, states.shape[-1]), self._heads[head])
         return logit.float().sigmoid().reshape(states.shape[:-1])
 
-    def _carry(
+    def _unroll(
         self, latent: Tensor, plan: Tensor, members: Tensor, groups: list[Groups] | None, noise: Tensor
     ) -> list[Tensor]:
         """P particles of every plan ``[H, R, A]``: the latents ``[P, R, D]`` they visit, in layer precision."""

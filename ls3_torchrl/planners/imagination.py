@@ -16,7 +16,7 @@ from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, Sa
 
 
 class ImaginationNoise(NamedTuple):
-    """All randomness of one imagined population.
+    """All randomness of one imagined iteration.
 
     Attributes:
         members: member that moves particle p at step h, int64 ``[H, P]``; the same for all plans, which
@@ -29,7 +29,7 @@ class ImaginationNoise(NamedTuple):
 
 
 class PlanNoise(NamedTuple):
-    """All randomness of a plan over K populations, for plans that must be repeatable.
+    """All randomness of a plan over K iterations, for plans that must be repeatable.
 
     Attributes:
         normal: candidates' Gaussian noise ``[K, B, N, H, A]``.
@@ -64,7 +64,7 @@ class Limits(NamedTuple):
 class Imagination(Protocol):
     """Imagines candidate plans and reduces what it sees over the particles."""
 
-    def steady(self) -> AbstractContextManager[None]:
+    def parameters_fixed(self) -> AbstractContextManager[None]:
         """Within it no parameter changes, so that work on them need be done only once."""
 
     def __call__(
@@ -120,7 +120,7 @@ class RolloutImagination:
         self.constraint_reduction = constraint_reduction
         self.safe_set_reduction = safe_set_reduction
 
-    def steady(self) -> AbstractContextManager[None]:
+    def parameters_fixed(self) -> AbstractContextManager[None]:
         """Nothing is kept of the parameters here, so nothing can go stale."""
         return nullcontext()
 

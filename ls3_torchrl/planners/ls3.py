@@ -20,7 +20,7 @@ from ls3_torchrl._checks import (
 )
 from ls3_torchrl.modules.classifiers import LatentClassifier
 from ls3_torchrl.modules.value import ValueEnsemble
-from ls3_torchrl.planners.cem import CEMResult, CrossEntropyMethod, Judgement
+from ls3_torchrl.planners.cem import CEMResult, CrossEntropyMethod, PlanScores
 from ls3_torchrl.planners.fused import FusedImagination
 from ls3_torchrl.planners.imagination import (
     Imagination,
@@ -68,7 +68,7 @@ class LS3Planner(MPCPlannerBase):
         num_candidates: N.
         num_elites: sequences that the Gaussian is refitted on, 1 to N.
         num_particles: P, imagined outcomes of each plan.
-        optim_steps: scored rounds. Table 1's n_cem_iters = 5 samples five populations and scores four.
+        optim_steps: scored rounds. Table 1's n_cem_iters = 5 samples five iterations and scores four.
         safe_set_threshold: initial δ_S, a probability strictly between 0 and 1.
         constraint_threshold: δ_C, likewise.
         relaxation: factor on δ_S when nothing is feasible, strictly between 0 and 1.
@@ -98,7 +98,7 @@ class LS3Planner(MPCPlannerBase):
 
     Returns:
         From the call: the tensordict with ``action``, and under ``plan`` ``feasible``, ``fallback``,
-        ``safe_set_threshold`` (the δ_S acted on), ``score``, ``populations``, all ``[*B, 1]``; under
+        ``safe_set_threshold`` (the δ_S acted on), ``score``, ``iterations``, all ``[*B, 1]``; under
         ``("next", "plan")`` the warm start ``mean`` and ``std`` ``[*B, H, A]``.
 
     Raises:
@@ -205,14 +205,14 @@ class LS3Planner(MPCPlannerBase):
         """All noise that a plan for ``batch`` rows can need; large, meant for tests and comparisons."""
         device, rows = self.action_spec.device, torch.arange(batch, device=self.action_spec.device)
         draws = [
-            (*self._draw_candidates(rows, k), *self._draw_imagination(rows, k)) for k in range(self.cem.max_populations)
+            (*self._draw_candidates(rows, k), *self._draw_imagination(rows, k)) for k in range(self.cem.max_iterations)
         ]
         return PlanNoise(*(torch.stack(parts).to(device) for parts in zip(*draws, strict=True)))
 
-    def _draw_candidates(self, rows: Tensor, population: int) -> tuple[Tensor, Tensor]:
+    def _draw_candidates(self, rows: Tensor, iteration: int) -> tuple[Tensor, Tensor]:
         return self.cem.draw(rows, self.horizon, self.action_spec.shape[-1])
 
-    def _draw_imagination(self, rows: Tensor, population: int) -> ImaginationNoise:
+    def _draw_imagination(self, rows: Tensor, iteration: int) -> ImaginationNoise:
         dynamics = self.env.dynamics
         fixed = dynamics.propagation == "tsinf"
         candidates = 1 if self.common_noise else self.cem.num_candidates
@@ -233,9 +233,9 @@ class LS3Planner(MPCPlannerBase):
         require_finite(latent, "The latent to plan from")
         return latent
 
-    def judge(self, statistics: PlanStatistics, threshold: Tensor) -> Judgement:
+    def score_plans(self, statistics: PlanStatistics, threshold: Tensor) -> PlanScores:
         """Objective, feasibility and fallback ranking of candidates under δ_S ``[b, 1]``."""
-        return Judgement(
+        return PlanScores(
             objective(statistics, pessimism=self.pessimism, goal_reduction=self.goal_reduction),
             feasible(statistics, safe_set_threshold=threshold, constraint_threshold=self.constraint_threshold),
             least_harm(statistics, constraint_threshold=self.constraint_threshold),
@@ -259,23 +259,23 @@ class LS3Planner(MPCPlannerBase):
         """
         space = self.action_spec.space
 
-        def evaluate(actions: Tensor, rows: Tensor, restarts: Tensor, population: int) -> Judgement:
+        def score(actions: Tensor, rows: Tensor, restarts: Tensor, iteration: int) -> PlanScores:
             if noise is None:
-                drawn = self._draw_imagination(rows, population)
+                drawn = self._draw_imagination(rows, iteration)
             else:
-                drawn = ImaginationNoise(noise.members[population], noise.dynamics[population][rows])
+                drawn = ImaginationNoise(noise.members[iteration], noise.dynamics[iteration][rows])
             threshold = self._threshold(restarts).unsqueeze(-1)
             limits = Limits(threshold, self.constraint_threshold)
-            return self.judge(self.imagine(latent[rows], actions, drawn, limits), threshold)
+            return self.score_plans(self.imagine(latent[rows], actions, drawn, limits), threshold)
 
-        def candidates(rows: Tensor, population: int) -> tuple[Tensor, Tensor]:
+        def candidates(rows: Tensor, iteration: int) -> tuple[Tensor, Tensor]:
             if noise is None:
-                return self._draw_candidates(rows, population)
-            return noise.normal[population][rows], noise.uniform[population][rows]
+                return self._draw_candidates(rows, iteration)
+            return noise.normal[iteration][rows], noise.uniform[iteration][rows]
 
-        with self.imagine.steady():
+        with self.imagine.parameters_fixed():
             return self.cem(
-                evaluate,
+                score,
                 space.low,
                 space.high,
                 batch=latent.shape[0],
@@ -312,7 +312,7 @@ class LS3Planner(MPCPlannerBase):
             "fallback": result.fallback,
             "safe_set_threshold": self._threshold(result.restarts),
             "score": result.score,
-            "populations": result.populations,
+            "iterations": result.iterations,
         }
         out.set(self.action_key, result.actions[:, 0].reshape(*batch, -1))
         for name, value in decisions.items():
@@ -328,7 +328,7 @@ class LS3Planner(MPCPlannerBase):
         return self.imagine(latent, actions, ImaginationNoise(noise.members, noise.noise[:, :, :, :candidates]))
 
 
-_DECISIONS = ("feasible", "fallback", "safe_set_threshold", "score", "populations")
+_DECISIONS = ("feasible", "fallback", "safe_set_threshold", "score", "iterations")
 
 
 def describe_plan(tensordict: TensorDictBase, plan_key: NestedKey = "plan") -> TensorDict:
@@ -339,7 +339,7 @@ def describe_plan(tensordict: TensorDictBase, plan_key: NestedKey = "plan") -> T
         plan_key: the planner's group.
 
     Returns:
-        Scalars ``fallback_rate``, ``relaxed_rate`` and ``populations``.
+        Scalars ``fallback_rate``, ``relaxed_rate`` and ``iterations``.
     """
     plan = tensordict.get(plan_key)
     threshold = plan["safe_set_threshold"]
@@ -347,6 +347,6 @@ def describe_plan(tensordict: TensorDictBase, plan_key: NestedKey = "plan") -> T
         {
             "fallback_rate": plan["fallback"].float().mean(),
             "relaxed_rate": (threshold < threshold.amax() - 1e-6).float().mean(),
-            "populations": plan["populations"].float().mean(),
+            "iterations": plan["iterations"].float().mean(),
         }
     )

@@ -76,8 +76,8 @@ def test_labels_and_tags_are_right_by_hand(scratch):
     assert len(buffer) == 5
     assert rows["tag"].flatten().tolist() == [0, 0, 0, 2, 2]
     assert rows["in_success"].flatten().tolist() == [True, True, False, False, False]
-    assert rows["undecided"].flatten().tolist() == [False, False, False, True, True]
-    assert rows["frozen"].flatten().tolist() == [False, True, True, False, False]
+    assert rows["timed_out"].flatten().tolist() == [False, False, False, True, True]
+    assert rows["after_violation"].flatten().tolist() == [False, True, True, False, False]
     assert rows["reward_to_go"].flatten().tolist() == [-1.25, -0.5, -1.0, -1.5, -1.0]
     assert rows["next", "success"].flatten().tolist() == [False, True, False, False, False]
     assert rows["next", "reward"].flatten().tolist() == [-1.0, 0.0, -1.0, -1.0, -1.0]
@@ -98,7 +98,7 @@ def test_a_success_tail_keeps_the_labels_and_leaves_the_idle_end_out(scratch):
         buffer.add(episode, "success")
         buffer.add(film.shoot(2), "constraint")
     assert (len(kept), len(whole)) == (5 + 2, 8 + 2)
-    for key in ("reward_to_go", "in_success", "undecided", "frozen", "action", ("next", "success")):
+    for key in ("reward_to_go", "in_success", "timed_out", "after_violation", "action", ("next", "success")):
         assert torch.equal(kept.latents.storage[:][key][:5], whole.latents.storage[:][key][:5]), key
     # Stretches end with what was kept, and every row finds its own frames.
     assert kept.latents.storage[:]["steps_left"].flatten().tolist() == [5, 4, 3, 2, 1, 2, 1]
@@ -264,7 +264,7 @@ def test_sample_honours_tags_added_before_and_after_a_view_was_made():
     assert set(buffer.sample(500)["tag"].flatten().tolist()) == {0, 3}
 
 
-@pytest.mark.parametrize("how", [{}, {"members": 2}, {"steps": 2}, {"without": "frozen"}])
+@pytest.mark.parametrize("how", [{}, {"members": 2}, {"steps": 2}, {"without": "after_violation"}])
 def test_online_rows_have_their_share_of_every_kind_of_batch(how):
     torch.manual_seed(0)
     film = Film()
@@ -273,14 +273,14 @@ def test_online_rows_have_their_share_of_every_kind_of_batch(how):
     for _ in range(30):  # a frame in three violates, and what comes after it is frozen
         buffer.add(film.shoot(3), "success")
     buffer.add(film.shoot(5), "online")
-    batch = buffer.sample(400, online_share=0.5, **how)
+    batch = buffer.sample(400, online_fraction=0.5, **how)
     assert batch.batch_size[0] == 400
     assert (batch["tag"] == int(Tag.ONLINE)).float().mean() == 0.5
     assert (buffer.sample(400, **how)["tag"] == int(Tag.ONLINE)).float().mean() < 0.25
     # What is asked of rows holds for both parts.
     if "without" in how:
-        assert buffer.latents.storage[:]["frozen"].any()
-        assert not batch["frozen"].any()
+        assert buffer.latents.storage[:]["after_violation"].any()
+        assert not batch["after_violation"].any()
     if "steps" in how:
         number = batch["action"][..., 0]
         assert (number[:, 1] == number[:, 0] + 1).all()
@@ -341,7 +341,7 @@ def test_stretches_follow_one_episode_over_the_rings_end(scratch):
     assert torch.equal(pixels["pixels"][:, 0, 0, 0].int(), number[:, 0])
     assert torch.equal(pixels["next", "pixels"][:, 0, 0, 0].int(), number[:, -1] + 1)
     buffer.encode(reading_encoder())
-    rows = buffer.sample(100, members=2, steps=2, without="frozen")
+    rows = buffer.sample(100, members=2, steps=2, without="after_violation")
     assert rows.shape == (100, 2, 2)
     number = rows["action"][..., 0]
     # Frames 3, 6, 9 and 12 lead to violations, after which an episode is frozen.

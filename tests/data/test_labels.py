@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ls3_torchrl.data import failure_tail, frozen, in_success, reward_to_go, undecided, without_idle_end
+from ls3_torchrl.data import after_violation, failure_tail, in_success, length_without_idle_end, reward_to_go, timed_out
 
 
 def test_reward_to_go_by_hand():
@@ -58,13 +58,13 @@ def test_in_success_keeps_the_rows_of_a_batch_apart():
 )
 def test_undecided_is_neither_a_success_nor_a_violation(success, constraint, expected):
     outcome = (torch.tensor(values).bool().unsqueeze(-1) for values in (success, constraint))
-    assert undecided(*outcome).flatten().tolist() == [expected] * 3
+    assert timed_out(*outcome).flatten().tolist() == [expected] * 3
 
 
 def test_undecided_keeps_the_rows_of_a_batch_apart():
     success = torch.zeros(2, 5, 1, dtype=torch.bool)
     success[0, 3] = True
-    assert undecided(success, torch.zeros_like(success)).squeeze(-1).int().tolist() == [[0] * 5, [1] * 5]
+    assert timed_out(success, torch.zeros_like(success)).squeeze(-1).int().tolist() == [[0] * 5, [1] * 5]
 
 
 def test_a_failure_goes_on_for_ever_with_its_last_reward():
@@ -99,7 +99,7 @@ def test_frozen_are_the_steps_after_the_first_violation_row_by_row():
     constraint = torch.zeros(3, 5, 1, dtype=torch.bool)
     constraint[0, 2:] = True
     constraint[1, 1] = True  # even where the flag does not stay
-    assert frozen(constraint).squeeze(-1).int().tolist() == [[0, 0, 0, 1, 1], [0, 0, 1, 1, 1], [0] * 5]
+    assert after_violation(constraint).squeeze(-1).int().tolist() == [[0, 0, 0, 1, 1], [0, 0, 1, 1, 1], [0] * 5]
 
 
 @pytest.mark.parametrize(
@@ -114,4 +114,4 @@ def test_frozen_are_the_steps_after_the_first_violation_row_by_row():
     ],
 )
 def test_the_idle_end_by_hand(success, tail, left):
-    assert without_idle_end(torch.tensor(success).bool().unsqueeze(-1), tail) == left
+    assert length_without_idle_end(torch.tensor(success).bool().unsqueeze(-1), tail) == left

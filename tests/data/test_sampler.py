@@ -47,9 +47,11 @@ def test_a_tag_without_rows_says_which_and_what_to_do(tags):
 
 
 def test_rows_that_say_so_are_left_out():
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8), sampler=TagSampler(["success"], without="frozen"))
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(8), sampler=TagSampler(["success"], without="after_violation")
+    )
     frozen = torch.tensor([False, True, False, False]).unsqueeze(-1)
-    buffer.extend(rows([0, 0, 1, 0]).set("frozen", frozen))
+    buffer.extend(rows([0, 0, 1, 0]).set("after_violation", frozen))
     assert buffer.sampler.rows(buffer.storage).tolist() == [0, 3]
 
 
@@ -99,7 +101,7 @@ def shares(buffer, count=400):
 
 
 def buffer_with_share(tags, share, wanted=("success", "rand", "online")):
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(256), sampler=TagSampler(wanted, online_share=share))
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(256), sampler=TagSampler(wanted, online_fraction=share))
     buffer.extend(rows(tags))
     return buffer
 
@@ -134,5 +136,5 @@ def test_the_share_follows_rows_that_come_later():
 
 @pytest.mark.parametrize("share", [-0.1, 1.0])
 def test_impossible_shares_are_refused(share):
-    with pytest.raises(ValueError, match=rf"online_share must be in \[0, 1\), got {share}"):
-        TagSampler(["online"], online_share=share)
+    with pytest.raises(ValueError, match=rf"online_fraction must be in \[0, 1\), got {share}"):
+        TagSampler(["online"], online_fraction=share)

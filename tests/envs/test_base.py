@@ -14,10 +14,10 @@ from ls3_envs import VisualConstraintEnv
 class LineEnv(VisualConstraintEnv):
     """A point moves along a line; it starts near 0, must stay below 5, and wants to be at -5 or below."""
 
-    def __init__(self, num_worlds: int = 1, *, start: float = 0.0, horizon: int = 8, seed: int | None = 0) -> None:
+    def __init__(self, num_envs: int = 1, *, start: float = 0.0, horizon: int = 8, seed: int | None = 0) -> None:
         self.start = start
         super().__init__(
-            num_worlds=num_worlds,
+            num_envs=num_envs,
             state_dim=1,
             action_low=(-2.0,),
             action_high=(2.0,),
@@ -53,9 +53,9 @@ def play(env: VisualConstraintEnv, actions: list[list[float]]) -> TensorDict:
     return torch.stack(steps, 1)
 
 
-@pytest.mark.parametrize("num_worlds", [1, 3])
-def test_specs_describe_what_the_environment_returns(num_worlds: int):
-    check_env_specs(LineEnv(num_worlds))
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_specs_describe_what_the_environment_returns(num_envs: int):
+    check_env_specs(LineEnv(num_envs))
 
 
 def test_key_set_shapes_and_dtypes():
@@ -173,7 +173,7 @@ def test_without_a_seed_torchs_generator_decides():
 
 
 def test_sizes_below_one_are_refused():
-    with pytest.raises(ValueError, match="num_worlds must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
         LineEnv(0)
     with pytest.raises(ValueError, match="horizon must be at least 1 step, got 0"):
         LineEnv(horizon=0)

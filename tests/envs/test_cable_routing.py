@@ -14,7 +14,7 @@ def with_the_end_at(env: CableRoutingEnv, x: float, y: float) -> torch.Tensor:
 
 
 def test_the_observation_is_the_cables_mask_in_three_equal_channels():
-    env, coloured = (CableRoutingEnv(num_worlds=2, observation=name, seed=0) for name in ("mask", "rgb"))
+    env, coloured = (CableRoutingEnv(num_envs=2, observation=name, seed=0) for name in ("mask", "rgb"))
     mask, picture = (e.reset()["pixels"] for e in (env, coloured))
     assert set(mask.unique().tolist()) == {0, 255}
     assert torch.equal(mask[:, 0], mask[:, 1])
@@ -28,7 +28,7 @@ def test_the_observation_is_the_cables_mask_in_three_equal_channels():
 
 
 def test_cable_over_the_goal_is_success_and_over_the_obstacle_a_violation():
-    env = CableRoutingEnv(num_worlds=1, seed=0)
+    env = CableRoutingEnv(num_envs=1, seed=0)
     for place, success, violation in (
         (GOAL, True, False),
         (OBSTACLE, False, True),
@@ -41,7 +41,7 @@ def test_cable_over_the_goal_is_success_and_over_the_obstacle_a_violation():
 
 
 def test_the_grasped_end_goes_where_it_is_told_and_the_cable_follows():
-    env = CableRoutingEnv(num_worlds=1, seed=0)
+    env = CableRoutingEnv(num_envs=1, seed=0)
     td = env.reset()
     start = td["state"][0, :2].clone()
     moved = env.step(td.set("action", torch.tensor([[0.01, 0.02]])))["next", "state"][0]
@@ -56,7 +56,7 @@ def test_an_unknown_observation_is_refused():
 
 @pytest.mark.parametrize("way", [(1, 0), (-1, 0), (0, 1), (0, -1)])
 def test_the_grasped_end_stays_in_the_picture(way):
-    env = CableRoutingEnv(num_worlds=1, seed=0)
+    env = CableRoutingEnv(num_envs=1, seed=0)
     td = env.reset()
     state = env._state
     for _ in range(25):

@@ -52,7 +52,7 @@ def test_all_fifty_violators_violate_and_none_starts_in_the_wall(violations: Ten
 
 
 def test_violators_move_in_one_direction_for_15_steps_and_then_towards_the_wall():
-    env = TransformedEnv(NavigationEnv(num_worlds=50, start="random", seed=0), InitTracker())
+    env = TransformedEnv(NavigationEnv(num_envs=50, start="random", seed=0), InitTracker())
     episodes = collect_episodes(env, NavigationViolator(noise_std=0.0, seed=0))
     actions = episodes["action"][:, :15]
     assert torch.equal(actions, actions[:, :1].expand_as(actions))
@@ -103,7 +103,7 @@ def test_the_script_restarts_with_each_world():
 
 
 def test_collect_episodes_runs_every_world_to_its_horizon():
-    env = TransformedEnv(NavigationEnv(num_worlds=2, horizon=7, seed=0), InitTracker())
+    env = TransformedEnv(NavigationEnv(num_envs=2, horizon=7, seed=0), InitTracker())
     episodes = collect_episodes(env, NavigationDemonstrator(seed=0))
     assert episodes.batch_size == (2, 7)
     assert not episodes["action"].requires_grad

@@ -38,7 +38,7 @@ def test_an_episode(name):
 def test_the_images_are_the_environments_own():
     env = gymnasium.make("ls3/Navigation-v0")
     observation, _ = env.reset(seed=3)
-    own = ls3_envs.NavigationEnv(num_worlds=1, seed=3).reset()["pixels"][0]
+    own = ls3_envs.NavigationEnv(num_envs=1, seed=3).reset()["pixels"][0]
     np.testing.assert_array_equal(observation, own.permute(1, 2, 0).numpy())
 
 
@@ -65,7 +65,7 @@ def test_a_vector_of_worlds_starts_ended_ones_anew():
     assert rewards.tolist() == [0.0, 0.0]
     assert not truncated.any()
     # Each world lives the life that it lives alone.
-    alone = ls3_envs.NavigationEnv(num_worlds=1, horizon=3, seed=0)
+    alone = ls3_envs.NavigationEnv(num_envs=1, horizon=3, seed=0)
     alone.reset()
     np.testing.assert_array_equal(images[0], alone.reset()["pixels"][0].permute(1, 2, 0).numpy())
     assert not np.array_equal(images, first)

@@ -12,10 +12,10 @@ from ls3_envs import NavigationEnv
 from ls3_envs.navigation import in_wall
 
 
-def some_actions(num_worlds: int, steps: int) -> torch.Tensor:
+def some_actions(num_envs: int, steps: int) -> torch.Tensor:
     """Actions [N, T, 2] in the box; the first rows do not depend on how many there are."""
     generator = torch.Generator().manual_seed(7)
-    return 6 * torch.rand(8, steps, 2, generator=generator)[:num_worlds] - 3
+    return 6 * torch.rand(8, steps, 2, generator=generator)[:num_envs] - 3
 
 
 def play(env: NavigationEnv, actions: torch.Tensor) -> TensorDict:
@@ -42,13 +42,13 @@ def picture(*position: float) -> torch.Tensor:
 # Specs, seeds and episodes
 
 
-@pytest.mark.parametrize("options", [{"num_worlds": 1}, {"num_worlds": 3, "start": "random"}])
+@pytest.mark.parametrize("options", [{"num_envs": 1}, {"num_envs": 3, "start": "random"}])
 def test_specs_describe_what_the_environment_returns(options: dict):
     check_env_specs(NavigationEnv(horizon=5, **options))
 
 
 def test_papers_sizes():
-    env = NavigationEnv(num_worlds=2)
+    env = NavigationEnv(num_envs=2)
     assert env.horizon == 100
     assert env.action_spec.shape == (2, 2)
     assert env.action_spec.space.low.unique().tolist() == [-3.0]

@@ -19,7 +19,7 @@ from ls3_envs.pushing import (
 
 
 def with_blocks_at(y: list[float], z: float = 0.03) -> torch.Tensor:
-    env = SequentialPushingEnv(num_worlds=1, seed=0)
+    env = SequentialPushingEnv(num_envs=1, seed=0)
     env.reset()
     state = env._state.clone()
     for i, value in enumerate(y):
@@ -28,7 +28,7 @@ def with_blocks_at(y: list[float], z: float = 0.03) -> torch.Tensor:
 
 
 def test_blocks_stand_in_a_row_with_clear_gaps():
-    state = SequentialPushingEnv(num_worlds=1, seed=0).reset()["state"]
+    state = SequentialPushingEnv(num_envs=1, seed=0).reset()["state"]
     places = block_positions(state)[0]
     torch.testing.assert_close(places[:, 0], torch.tensor(BLOCKS_X))
     assert (places[1:, 0] - places[:-1, 0] > 0.08).all()
@@ -45,7 +45,7 @@ def test_blocks_stand_in_a_row_with_clear_gaps():
     ],
 )
 def test_all_blocks_past_the_line_are_success_and_one_past_the_edge_is_a_violation(y, success, constraint):
-    env = SequentialPushingEnv(num_worlds=1, seed=0)
+    env = SequentialPushingEnv(num_envs=1, seed=0)
     state = with_blocks_at(y)
     assert bool(env._succeeds(state)) is success
     assert bool(env._violates(state)) is constraint
@@ -54,11 +54,11 @@ def test_all_blocks_past_the_line_are_success_and_one_past_the_edge_is_a_violati
 
 
 def test_a_block_that_fell_is_a_violation():
-    assert bool(SequentialPushingEnv(num_worlds=1, seed=0)._violates(with_blocks_at([0.0, 0.0, 0.1], z=-0.1)))
+    assert bool(SequentialPushingEnv(num_envs=1, seed=0)._violates(with_blocks_at([0.0, 0.0, 0.1], z=-0.1)))
 
 
 def test_the_hand_goes_where_it_is_told_and_takes_a_block_along():
-    env = SequentialPushingEnv(num_worlds=1, seed=0)
+    env = SequentialPushingEnv(num_envs=1, seed=0)
     td = env.reset()
     start = hand_position(td["state"])[0].clone()
     td = env.step(td.set("action", torch.tensor([[0.02, 0.01]])))
@@ -74,7 +74,7 @@ def test_the_hand_goes_where_it_is_told_and_takes_a_block_along():
 
 @pytest.mark.parametrize("way", [(1, 0), (-1, 0), (0, 1), (0, -1)])
 def test_the_hand_stays_on_the_table_and_its_tip_in_the_picture(way):
-    env = SequentialPushingEnv(num_worlds=1, seed=0)
+    env = SequentialPushingEnv(num_envs=1, seed=0)
     td = env.reset()
     for _ in range(15):
         td = step_mdp(env.step(td.set("action", 0.05 * torch.tensor([way], dtype=torch.float32))))
@@ -86,14 +86,14 @@ def test_the_hand_stays_on_the_table_and_its_tip_in_the_picture(way):
 
 
 def test_the_arm_is_a_picture_only():
-    arm = SequentialPushingEnv(num_worlds=1, seed=0).model.geom("arm")
+    arm = SequentialPushingEnv(num_envs=1, seed=0).model.geom("arm")
     assert int(arm.contype[0]) == int(arm.conaffinity[0]) == 0
-    env = SequentialPushingEnv(num_worlds=1, seed=0)
+    env = SequentialPushingEnv(num_envs=1, seed=0)
     assert float(env.model.body("hand").mass[0]) == pytest.approx(0.5)
 
 
 def test_a_random_start_has_each_block_in_its_place_or_in_its_goal():
-    state = SequentialPushingEnv(num_worlds=200, start="random", seed=0).reset()["state"]
+    state = SequentialPushingEnv(num_envs=200, start="random", seed=0).reset()["state"]
     y = block_positions(state)[..., 1]
     waiting, there = y == 0.0, (y > GOAL_Y) & (y < TABLE[1] - BLOCK_SIDE / 2)
     assert (waiting | there).all()
@@ -105,7 +105,7 @@ def test_a_random_start_has_each_block_in_its_place_or_in_its_goal():
 
 def pushed_askew(hand: str, offset: float) -> tuple[float, float]:
     """How far the middle block goes along y and turns, pushed 10 cm by a hand that is off its middle."""
-    env = SequentialPushingEnv(num_worlds=1, hand=hand, seed=0)
+    env = SequentialPushingEnv(num_envs=1, hand=hand, seed=0)
     td = env.reset()
     env._state[0, 21:23] = torch.tensor([offset, -0.06])
     for _ in range(2):

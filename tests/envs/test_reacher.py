@@ -26,7 +26,7 @@ def test_the_suites_own_model_with_its_torques_halved():
     model = reacher_model()
     assert model.opt.timestep == 0.02
     assert model.actuator("shoulder").gear[0] == 0.05
-    env = ReacherEnv(num_worlds=1, seed=0)
+    env = ReacherEnv(num_envs=1, seed=0)
     env.reset()
     start = env._state.clone()
     stepped = env.step(env.reset().set("action", torch.tensor([[1.0, -0.5]])))
@@ -37,7 +37,7 @@ def test_the_suites_own_model_with_its_torques_halved():
 
 
 def test_the_start_is_fixed_safe_and_not_in_the_goal():
-    first = ReacherEnv(num_worlds=3, seed=1).reset()
+    first = ReacherEnv(num_envs=3, seed=1).reset()
     expected = torch.tensor([0.53 * math.pi, 0.85 * math.pi, 0.0, 0.0]).expand(3, -1)
     torch.testing.assert_close(first["state"], expected)
     assert not first["constraint"].any()
@@ -45,14 +45,14 @@ def test_the_start_is_fixed_safe_and_not_in_the_goal():
 
 
 def test_random_starts_are_safe_and_differ():
-    first = ReacherEnv(num_worlds=64, start="random", seed=1).reset()
+    first = ReacherEnv(num_envs=64, start="random", seed=1).reset()
     assert not first["constraint"].any()
     assert first["state"][:, :2].std(0).min() > 0.5
     assert (first["state"][:, 2:] == 0).all()
 
 
 def test_goal_and_stay_out_disc_are_drawn_where_they_count():
-    pixels = ReacherEnv(num_worlds=1, seed=0).reset()["pixels"][0].float()
+    pixels = ReacherEnv(num_envs=1, seed=0).reset()["pixels"][0].float()
     green = (pixels[1] > pixels[0] + 60) & (pixels[1] > pixels[2] + 60)
     red = (pixels[0] > pixels[1] + 60) & (pixels[0] > pixels[2] + 100)
     for mask, (x, y) in ((green, GOAL), (red, OBSTACLE)):

@@ -28,7 +28,7 @@ def test_the_other_domains_have_the_papers_numbers():
     ("name", "channels"), [("navigation", 3), ("reacher", 9), ("pushing", 3), ("cable_routing", 3)]
 )
 def test_every_domain_can_be_made(name: str, channels: int):
-    env = make(name, num_worlds=2, seed=0)
+    env = make(name, num_envs=2, seed=0)
     assert isinstance(env.base_env, VisualConstraintEnv)
     assert env.batch_size == (2,)
     first = env.reset()
@@ -38,7 +38,7 @@ def test_every_domain_can_be_made(name: str, channels: int):
 
 
 def test_frames_some_steps_apart_are_stacked_the_newest_last_and_the_first_repeats():
-    env, single = (make("navigation", num_worlds=2, frames=k, frame_stride=2, seed=0) for k in (3, 1))
+    env, single = (make("navigation", num_envs=2, frames=k, frame_stride=2, seed=0) for k in (3, 1))
     torch.manual_seed(0)
     stacked = env.rollout(7)
     torch.manual_seed(0)
@@ -50,14 +50,14 @@ def test_frames_some_steps_apart_are_stacked_the_newest_last_and_the_first_repea
 
 
 def test_reacher_stacks_three_frames_four_steps_apart():
-    episode = make("reacher", num_worlds=1, seed=0).rollout(12)
+    episode = make("reacher", num_envs=1, seed=0).rollout(12)
     oldest, middle, newest = episode["pixels"][0].unflatten(1, (3, 3)).unbind(1)
     assert torch.equal(oldest[10], newest[2])
     assert torch.equal(middle[10], newest[6])
 
 
 def test_frames_are_stacked_the_newest_last():
-    env, single = (make("navigation", num_worlds=1, frames=k, seed=0) for k in (3, 1))
+    env, single = (make("navigation", num_envs=1, frames=k, seed=0) for k in (3, 1))
     stacked, alone = (e.rollout(4, set_to_zero_but_one) for e in (env, single))
     frames = alone["next", "pixels"][0]
     torch.testing.assert_close(stacked["pixels"][0, 0], alone["pixels"][0, 0].repeat(3, 1, 1))  # the first one, thrice
@@ -85,8 +85,8 @@ def test_more_episodes_than_are_collected_at_once_begin_with_the_same_ones(monke
 
 
 def test_make_passes_its_options_on():
-    env = make("navigation", num_worlds=3, horizon=7, start="random", seed=1)
-    assert (env.num_worlds, env.horizon, env.start) == (3, 7, "random")
+    env = make("navigation", num_envs=3, horizon=7, start="random", seed=1)
+    assert (env.num_envs, env.horizon, env.start) == (3, 7, "random")
     assert torch.equal(env.reset()["state"], NavigationEnv(3, horizon=7, start="random", seed=1).reset()["state"])
 
 

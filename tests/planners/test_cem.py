@@ -1,15 +1,15 @@
 import pytest
 import torch
 
-from ls3_torchrl.planners import CrossEntropyMethod, Judgement
+from ls3_torchrl.planners import CrossEntropyMethod, PlanScores
 
 LOW, HIGH = torch.tensor([-3.0, 0.5]), torch.tensor([-1.0, 2.0])
 
 
 def quadratic(target):
-    def judge(actions, rows, restarts, population):
+    def judge(actions, rows, restarts, iteration):
         score = -(actions - torch.as_tensor(target)).square().sum((-1, -2))
-        return Judgement(score, torch.ones_like(score, dtype=torch.bool), score)
+        return PlanScores(score, torch.ones_like(score, dtype=torch.bool), score)
 
     return judge
 
@@ -20,18 +20,18 @@ class Record:
     def __init__(self, judge):
         self.judge, self.asked = judge, []
 
-    def __call__(self, actions, rows, restarts, population):
-        judgement = self.judge(actions, rows, restarts, population)
-        self.asked.append((actions.clone(), rows.clone(), restarts.clone(), population, judgement))
+    def __call__(self, actions, rows, restarts, iteration):
+        judgement = self.judge(actions, rows, restarts, iteration)
+        self.asked.append((actions.clone(), rows.clone(), restarts.clone(), iteration, judgement))
         return judgement
 
 
 def table(batch, cem, horizon, action_dim=2, seed=0):
-    """Noise that depends on row and population alone, whatever else is asked for."""
+    """Noise that depends on row and iteration alone, whatever else is asked for."""
     generator = torch.Generator().manual_seed(seed)
-    shape = (cem.max_populations, batch, cem.num_candidates, horizon, action_dim)
+    shape = (cem.max_iterations, batch, cem.num_candidates, horizon, action_dim)
     normal, uniform = torch.randn(shape, generator=generator), torch.rand(shape, generator=generator)
-    return normal, uniform, lambda rows, population: (normal[population][rows], uniform[population][rows])
+    return normal, uniform, lambda rows, iteration: (normal[iteration][rows], uniform[iteration][rows])
 
 
 def test_finds_the_optimum_inside_the_box():
@@ -98,9 +98,9 @@ def test_elites_refit_by_hand():
 def test_elites_come_from_feasible_candidates_even_if_they_are_few():
     torch.manual_seed(0)
 
-    def three_bad_ones(actions, rows, restarts, population):
+    def three_bad_ones(actions, rows, restarts, iteration):
         score = -torch.arange(10.0).expand(1, -1)  # the infeasible ones score best
-        return Judgement(score, torch.arange(10).expand(1, -1) >= 7, score)
+        return PlanScores(score, torch.arange(10).expand(1, -1) >= 7, score)
 
     record = Record(three_bad_ones)
     result = CrossEntropyMethod(num_candidates=10, num_elites=5, optim_steps=1)(record, LOW, HIGH, batch=1, horizon=2)
@@ -115,10 +115,10 @@ def test_elites_come_from_feasible_candidates_even_if_they_are_few():
 def test_nan_ranks_last():
     torch.manual_seed(0)
 
-    def mostly_nan(actions, rows, restarts, population):
+    def mostly_nan(actions, rows, restarts, iteration):
         score = torch.full((1, 10), torch.nan)
         score[0, 3], score[0, 8] = -50.0, -60.0
-        return Judgement(score, torch.ones(1, 10, dtype=torch.bool), torch.zeros(1, 10))
+        return PlanScores(score, torch.ones(1, 10, dtype=torch.bool), torch.zeros(1, 10))
 
     record = Record(mostly_nan)
     result = CrossEntropyMethod(num_candidates=10, num_elites=5, optim_steps=1)(record, LOW, HIGH, batch=1, horizon=2)
@@ -131,11 +131,11 @@ def test_nan_ranks_last():
 def test_scores_that_rank_nothing_count_as_infeasible_and_never_leave_the_box(worthless):
     torch.manual_seed(0)
 
-    def judge(actions, rows, restarts, population):
+    def judge(actions, rows, restarts, iteration):
         score = torch.full((1, 10), worthless)
         fallback = torch.full((1, 10), torch.nan)
         fallback[0, 4] = -1e6
-        return Judgement(score, torch.ones(1, 10, dtype=torch.bool), fallback)
+        return PlanScores(score, torch.ones(1, 10, dtype=torch.bool), fallback)
 
     record = Record(judge)
     cem = CrossEntropyMethod(num_candidates=10, num_elites=5, optim_steps=2, max_restarts=1)
@@ -151,16 +151,16 @@ def test_scores_that_rank_nothing_count_as_infeasible_and_never_leave_the_box(wo
 def test_nothing_feasible_restarts_and_then_takes_the_best_fallback(max_restarts):
     torch.manual_seed(0)
 
-    def never(actions, rows, restarts, population):
+    def never(actions, rows, restarts, iteration):
         ranking = actions[..., 0].sum(-1)
-        return Judgement(-ranking, torch.zeros_like(ranking, dtype=torch.bool), ranking)
+        return PlanScores(-ranking, torch.zeros_like(ranking, dtype=torch.bool), ranking)
 
     record = Record(never)
     cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3, max_restarts=max_restarts)
     result = cem(record, LOW, HIGH, batch=2, horizon=2)
     assert result.fallback.tolist() == [True, True]
     assert result.restarts.tolist() == [max_restarts] * 2
-    assert result.populations.tolist() == [max_restarts + 1] * 2
+    assert result.iterations.tolist() == [max_restarts + 1] * 2
     assert [asked[2].tolist() for asked in record.asked] == [[k, k] for k in range(max_restarts + 1)]
     actions, *_, judgement = record.asked[-1]
     for row in range(2):
@@ -173,22 +173,22 @@ def test_nothing_feasible_restarts_and_then_takes_the_best_fallback(max_restarts
 def test_feasible_only_after_k_restarts(k):
     torch.manual_seed(0)
 
-    def later(actions, rows, restarts, population):
+    def later(actions, rows, restarts, iteration):
         score = -(actions + 2).square().sum((-1, -2))
-        return Judgement(score, (restarts >= k)[:, None].expand_as(score), score)
+        return PlanScores(score, (restarts >= k)[:, None].expand_as(score), score)
 
     cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3, max_restarts=4)
     result = cem(later, LOW, HIGH, batch=1, horizon=2)
     assert result.restarts.tolist() == [k]
-    assert result.populations.tolist() == [k + 3]  # the failed ones, then all rounds
+    assert result.iterations.tolist() == [k + 3]  # the failed ones, then all rounds
     assert result.fallback.tolist() == [False]
 
 
 def test_a_restart_begins_again_from_the_given_gaussian():
     # Feasible at first, nothing in the second round, feasible again after the restart.
-    def judge(actions, rows, restarts, population):
+    def judge(actions, rows, restarts, iteration):
         score = actions[..., 0].sum(-1)
-        return Judgement(score, torch.full_like(score, population != 1, dtype=torch.bool), score)
+        return PlanScores(score, torch.full_like(score, iteration != 1, dtype=torch.bool), score)
 
     cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=2, max_restarts=2, p_random=0.0)
     normal, _, noise = table(1, cem, 2)
@@ -197,7 +197,7 @@ def test_a_restart_begins_again_from_the_given_gaussian():
     std = torch.full((1, 2, 2), 0.1)
     result = cem(record, LOW, HIGH, batch=1, horizon=2, mean=mean, std=std, noise=noise)
     assert result.restarts.tolist() == [1]
-    assert result.populations.tolist() == [4]
+    assert result.iterations.tolist() == [4]
     torch.testing.assert_close(record.asked[2][0], (mean[:, None] + 0.1 * normal[2]).clamp(LOW, HIGH))
     refitted = record.asked[3][0]
     assert not torch.allclose(refitted, (mean[:, None] + 0.1 * normal[3]).clamp(LOW, HIGH))
@@ -206,9 +206,9 @@ def test_a_restart_begins_again_from_the_given_gaussian():
 def test_a_feasible_sequence_of_an_earlier_round_beats_a_fallback():
     torch.manual_seed(0)
 
-    def only_at_first(actions, rows, restarts, population):
+    def only_at_first(actions, rows, restarts, iteration):
         score = actions[..., 0].sum(-1)
-        return Judgement(score, torch.full_like(score, population == 0, dtype=torch.bool), -score)
+        return PlanScores(score, torch.full_like(score, iteration == 0, dtype=torch.bool), -score)
 
     record = Record(only_at_first)
     cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3, max_restarts=1)
@@ -225,10 +225,10 @@ def test_rows_are_independent():
     targets = torch.tensor([[-2.4, 1.1], [-1.2, 0.6], [-2.9, 1.9]])
 
     def judge_of(which):
-        def judge(actions, rows, restarts, population):
+        def judge(actions, rows, restarts, iteration):
             row = which[rows]
             score = -(actions - targets[row][:, None, None]).square().sum((-1, -2))
-            return Judgement(score, (restarts >= needs[row])[:, None].expand_as(score), 2 * score)
+            return PlanScores(score, (restarts >= needs[row])[:, None].expand_as(score), 2 * score)
 
         return judge
 
@@ -236,7 +236,7 @@ def test_rows_are_independent():
     normal, uniform, noise = table(3, cem, 2)
     start = {"mean": torch.tensor([-2.0, 1.0]) + 0.1 * torch.randn(3, 2, 2), "std": 0.3 * torch.rand(3, 2, 2)}
     together = cem(judge_of(torch.arange(3)), LOW, HIGH, batch=3, horizon=2, noise=noise, **start)
-    assert together.populations.tolist() == [3, 5, 4]
+    assert together.iterations.tolist() == [3, 5, 4]
     for i in range(3):
         alone = cem(
             judge_of(torch.tensor([i])),
@@ -266,7 +266,7 @@ def test_p_random_shares_the_first_round_between_box_and_warm_start(p_random, ex
     torch.testing.assert_close(first[:expected], LOW + (HIGH - LOW) * uniform[0, 0, :expected])
     # Later rounds are the refitted Gaussian alone.
     assert (second == second[:1]).all()
-    assert result.populations.tolist() == [2]
+    assert result.iterations.tolist() == [2]
 
 
 def test_held_candidates_repeat_their_first_uniform_action_in_the_first_round_alone():
@@ -287,9 +287,9 @@ def test_held_candidates_repeat_their_first_uniform_action_in_the_first_round_al
 
 def test_held_candidates_find_what_must_be_kept_up():
     # Only sequences that go up at nearly full speed at every step score: independent draws hardly ever do.
-    def judge(actions, rows, restarts, population):
+    def judge(actions, rows, restarts, iteration):
         score = torch.where((actions[..., 0] > 0.8).all(-1), 1.0, 0.0)
-        return Judgement(score, torch.ones_like(score, dtype=torch.bool), score)
+        return PlanScores(score, torch.ones_like(score, dtype=torch.bool), score)
 
     box = torch.tensor([-1.0]), torch.tensor([1.0])
     settings = {"num_candidates": 100, "num_elites": 10, "optim_steps": 1}
@@ -316,13 +316,13 @@ def test_every_population_is_scored_and_the_result_is_one_of_them():
     cem = CrossEntropyMethod(num_candidates=30, num_elites=5, optim_steps=4)
     record, drawn = Record(quadratic([-2.0, 1.0])), []
 
-    def noise(rows, population):
-        drawn.append(population)
+    def noise(rows, iteration):
+        drawn.append(iteration)
         return cem.draw(rows, 2, 2)
 
     result = cem(record, LOW, HIGH, batch=3, horizon=2, noise=noise)
     assert drawn == [asked[3] for asked in record.asked] == [0, 1, 2, 3]
-    assert result.populations.tolist() == [4, 4, 4]
+    assert result.iterations.tolist() == [4, 4, 4]
     scores = torch.stack([asked[-1].score for asked in record.asked])  # [K, B, N]
     torch.testing.assert_close(result.score, scores.amax((0, 2)))
     for row in range(3):
@@ -333,9 +333,9 @@ def test_every_population_is_scored_and_the_result_is_one_of_them():
 def test_the_best_of_all_rounds_is_kept_not_of_the_last():
     torch.manual_seed(0)
 
-    def ever_worse(actions, rows, restarts, population):
-        score = actions[..., 0].sum(-1) - 100.0 * population
-        return Judgement(score, torch.ones_like(score, dtype=torch.bool), score)
+    def ever_worse(actions, rows, restarts, iteration):
+        score = actions[..., 0].sum(-1) - 100.0 * iteration
+        return PlanScores(score, torch.ones_like(score, dtype=torch.bool), score)
 
     record = Record(ever_worse)
     result = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3)(record, LOW, HIGH, batch=1, horizon=2)
@@ -347,15 +347,15 @@ def test_the_best_of_all_rounds_is_kept_not_of_the_last():
 def test_finished_rows_are_not_judged_any_more():
     torch.manual_seed(0)
 
-    def judge(actions, rows, restarts, population):
+    def judge(actions, rows, restarts, iteration):
         score = actions[..., 0].sum(-1)
-        return Judgement(score, ((rows == 0) | (restarts >= 1))[:, None].expand_as(score), score)
+        return PlanScores(score, ((rows == 0) | (restarts >= 1))[:, None].expand_as(score), score)
 
     record = Record(judge)
     cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=2, max_restarts=1)
     result = cem(record, LOW, HIGH, batch=2, horizon=1)
     assert [asked[1].tolist() for asked in record.asked] == [[0, 1], [0, 1], [1]]
-    assert result.populations.tolist() == [2, 3]
+    assert result.iterations.tolist() == [2, 3]
 
 
 def test_the_given_start_is_left_as_it_was():

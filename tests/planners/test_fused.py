@@ -185,13 +185,13 @@ def test_within_a_steady_stretch_changes_are_looked_for_once_and_again_after_it(
     looked = []
     refresh = imagine.refresh
     imagine.refresh = lambda: looked.append(refresh())
-    with imagine.steady():
+    with imagine.parameters_fixed():
         first = imagine(*problem())
         imagine(*problem())
     assert looked == [True]
     with torch.no_grad():
         parts["safe_set"].network[-1].bias += 3.0
-    with suppress(RuntimeError), imagine.steady():
+    with suppress(RuntimeError), imagine.parameters_fixed():
         raise RuntimeError("an error in between must not leave it steady")
     after = imagine(*problem())
     assert looked == [True, True, False]

@@ -179,7 +179,7 @@ def test_the_threshold_is_relaxed_as_often_as_needed_and_no_further(prob, k):
     out = planner(latents(1))
     # 0.8, 0.64, 0.512, 0.4096, 0.32768, 0.262144
     assert out["plan", "safe_set_threshold"].item() == pytest.approx(0.8 * 0.8**k)
-    assert out["plan", "populations"].item() == k + SMALL["optim_steps"]
+    assert out["plan", "iterations"].item() == k + SMALL["optim_steps"]
     assert not out["plan", "fallback"].any()
 
 
@@ -191,7 +191,7 @@ def test_each_row_relaxes_for_itself():
     out = stub_planner(safe_set=safe_set)(TensorDict({"latent": start}, [3]))
     expected = torch.tensor([0.8, 0.8 * 0.8, 0.8 * 0.8**3])
     torch.testing.assert_close(out["plan", "safe_set_threshold"].flatten(), expected)
-    assert out["plan", "populations"].flatten().tolist() == [2, 3, 5]
+    assert out["plan", "iterations"].flatten().tolist() == [2, 3, 5]
 
 
 def test_relaxation_and_its_limit_are_settings():
@@ -204,7 +204,7 @@ def test_relaxation_and_its_limit_are_settings():
 
 @pytest.mark.parametrize("engine", ["fused", "rollout"])
 def test_without_a_feasible_plan_the_least_harmful_is_taken_not_a_random_one(engine):
-    # Violating everywhere; the end is the safer the further right: the best of the last population is known.
+    # Violating everywhere; the end is the safer the further right: the best of the last iteration is known.
     planner = stub_planner(
         constraint=judge(ConstraintEstimator, prob=0.9),
         safe_set=judge(SafeSet, slope=0.5, offset=4.0),
@@ -216,7 +216,7 @@ def test_without_a_feasible_plan_the_least_harmful_is_taken_not_a_random_one(eng
     out = planner(TensorDict({"latent": torch.zeros(2, D)}, [2]), noise=noise)
     assert out["plan", "fallback"].all()
     assert not out["plan", "feasible"].any()
-    assert out["plan", "populations"].flatten().tolist() == [3, 3]
+    assert out["plan", "iterations"].flatten().tolist() == [3, 3]
     torch.testing.assert_close(out["plan", "safe_set_threshold"], torch.full((2, 1), 0.8 * 0.8**2))
     candidates = -1 + 2 * noise.uniform[2]
     best = candidates[..., 0].sum(-1).argmax(-1)
@@ -244,10 +244,10 @@ def test_describe_plan_by_hand():
     plan = {
         "fallback": torch.tensor([[[False], [True]], [[False], [False]]]),
         "safe_set_threshold": torch.tensor([[[0.8], [0.26]], [[0.64], [0.8]]]),
-        "populations": torch.tensor([[[4], [6]], [[5], [4]]]),
+        "iterations": torch.tensor([[[4], [6]], [[5], [4]]]),
     }
     described = describe_plan(TensorDict({"me": {"plan": plan}}, [2, 2]), plan_key=("me", "plan"))
-    expected = {"fallback_rate": 0.25, "relaxed_rate": 0.5, "populations": 4.75}
+    expected = {"fallback_rate": 0.25, "relaxed_rate": 0.5, "iterations": 4.75}
     assert {name: round(value.item(), 6) for name, value in described.items()} == expected
 
 
@@ -265,7 +265,7 @@ def test_both_engines_pick_the_same_actions(propagation, reduction, common):
     noise = fused.draw_noise(4)
     one, other = (planner(latents(4), noise=noise) for planner in (fused, plain))
     torch.testing.assert_close(one["action"], other["action"], atol=1e-4, rtol=1e-4)
-    for name in ("feasible", "fallback", "populations"):
+    for name in ("feasible", "fallback", "iterations"):
         assert torch.equal(one["plan", name], other["plan", name])
     torch.testing.assert_close(one["plan", "score"], other["plan", "score"], atol=1e-3, rtol=1e-3)
     for name in ("mean", "std"):
@@ -287,12 +287,12 @@ def test_a_row_of_a_batch_is_planned_as_if_alone(engine, common):
     noise = planner.draw_noise(6)
     together = planner(start.clone(), noise=noise)
     # Rows at different rounds at the same time, or the test would show little.
-    assert together["plan", "populations"].unique().numel() > 1
+    assert together["plan", "iterations"].unique().numel() > 1
     for i in range(6):
         alone = planner(start[i : i + 1].clone(), noise=noise.row(i))
         for key in ("action", ("plan", "score"), ("next", "plan", "mean"), ("next", "plan", "std")):
             torch.testing.assert_close(together[key][i : i + 1], alone[key], atol=1e-4, rtol=1e-4, msg=str(key))
-        for name in ("feasible", "safe_set_threshold", "populations"):
+        for name in ("feasible", "safe_set_threshold", "iterations"):
             assert torch.equal(together["plan", name][i : i + 1], alone["plan", name])
 
 
@@ -310,11 +310,11 @@ def test_given_noise_makes_a_plan_repeatable_and_leaves_the_generator_alone():
 def test_the_shapes_of_all_noise(common):
     planner = random_planner("tsinf", common_noise=common, max_relaxations=1)
     noise = planner.draw_noise(5)
-    populations = 2 * 2  # rounds × (1 + relaxations)
-    assert noise.normal.shape == noise.uniform.shape == (populations, 5, 24, 3, A)
-    assert noise.members.shape == (populations, 3, 3)
+    iterations = 2 * 2  # rounds × (1 + relaxations)
+    assert noise.normal.shape == noise.uniform.shape == (iterations, 5, 24, 3, A)
+    assert noise.members.shape == (iterations, 3, 3)
     assert (noise.members == noise.members[:, :1]).all()
-    assert noise.dynamics.shape == (populations, 5, 3, 3, 1 if common else 24, D)
+    assert noise.dynamics.shape == (iterations, 5, 3, 3, 1 if common else 24, D)
     assert noise.row(2).dynamics.shape[1] == 1
     assert torch.equal(noise.row(2).normal[:, 0], noise.normal[:, 2])
 
@@ -324,7 +324,7 @@ def test_the_shapes_of_all_noise(common):
 def test_any_batch_shape_goes(engine, batch):
     out = random_planner(engine=engine)(latents(*batch))
     assert out["action"].shape == (*batch, A)
-    for name in ("feasible", "fallback", "safe_set_threshold", "score", "populations"):
+    for name in ("feasible", "fallback", "safe_set_threshold", "score", "iterations"):
         assert out["plan", name].shape == (*batch, 1)
     for name in ("mean", "std"):
         assert out["next", "plan", name].shape == (*batch, 3, A)

@@ -33,7 +33,7 @@ def test_the_expected_reward_sums_probabilities():
 
 
 def test_pessimism_subtracts_standard_deviations_over_members():
-    # Members 1 and 5: mean 3, population deviation 2. Members that agree lose nothing.
+    # Members 1 and 5: mean 3, iteration deviation 2. Members that agree lose nothing.
     plans = statistics(value=[[1.0, 5.0], [2.5, 2.5]])
     assert objective(plans, pessimism=0.5).tolist() == [2.0, 2.5]
     assert objective(plans, pessimism=0.0).tolist() == [3.0, 2.5]

@@ -62,7 +62,7 @@ def test_every_plan_of_a_permissive_agent_is_feasible():
     planner = agent.planner(Bounded(low=-1.0, high=1.0, shape=(2,)), num_candidates=20, num_elites=2, num_particles=2)
     result = planner.plan(torch.randn(3, 4))
     assert not result.fallback.any()
-    assert result.populations.tolist() == [4, 4, 4]
+    assert result.iterations.tolist() == [4, 4, 4]
 
 
 def test_the_plain_vae_has_the_layers_of_the_agents():

@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded
 from torchrl.objectives import HardUpdate
 
-from learning import Learner, Term, cooled_down
+from learning import AuxiliaryLoss, Learner, cooled_down
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.modules import ValueEnsemble
 from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, TD1ValueLoss
@@ -72,13 +72,13 @@ def test_a_term_beside_the_loss_pulls_the_same_network_with_its_weight():
     near_batch = TensorDict({"latent": z, "reward_to_go": torch.full((32, 1), -5.0)}, [32])
     far_batch = TensorDict({"latent": far, "reward_to_go": torch.full((32, 1), -60.0)}, [32])
     # On the same states, a term of weight 3 draws the least-squares value to three quarters of the way.
-    both = Term(3.0, OfflineValueLoss(value), lambda: far_batch.set("latent", z))
-    learner = Learner("value", OfflineValueLoss(value), lambda: near_batch, lr=0.05, beside=both)
+    both = AuxiliaryLoss(3.0, OfflineValueLoss(value), lambda: far_batch.set("latent", z))
+    learner = Learner("value", OfflineValueLoss(value), lambda: near_batch, lr=0.05, auxiliary=both)
     run = Silent()
     learner.train(600, "Value", run)
     middle = (-5.0 + 3.0 * -60.0) / 4.0
     assert value(TensorDict({"latent": z[:1]}, [1]))["state_value"].item() == pytest.approx(middle, abs=0.5)
-    assert "beside" in run.rows[-1][2]
+    assert "auxiliary" in run.rows[-1][2]
 
 
 @pytest.mark.parametrize("name", ["dynamics", "value", "safe_set"])
@@ -107,7 +107,7 @@ def test_losses_and_gradients_under_bf16_agree_with_fp32(name):
     for bf16 in (False, True):
         learner = Learner(name, loss, lambda: batch, lr=1e-3, bf16=bf16)
         learner.optimizer.zero_grad()
-        _, value = learner.evaluate()
+        _, value = learner.compute_loss()
         value.backward()
         assert all(p.grad.dtype == torch.float32 for p in learner.parameters)
         found.append((value.detach(), torch.cat([p.grad.flatten() for p in learner.parameters])))

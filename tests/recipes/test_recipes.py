@@ -81,7 +81,7 @@ TEXT = {
     "optim.dynamics_lr": 1e-3,
     "optim.target_interval": 100,
     "planner.relaxation": 0.8,
-    "planner.optim_steps": 4,  # n_cem_iters = 5 samples five populations and scores four
+    "planner.optim_steps": 4,  # n_cem_iters = 5 samples five iterations and scores four
     "planner.pessimism": 0.0,
     "planner.min_std": 0.0,
     "online.updates": 25,

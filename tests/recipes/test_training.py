@@ -16,12 +16,12 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(config):
     buffer = TaggedReplayBuffer(100, latent_dim=config.agent.latent_dim)
     drawn = {}
 
-    OmegaConf.update(config, "online.share", 0.25)
+    OmegaConf.update(config, "online.fraction", 0.25)
 
-    def sample(batch_size, *, tags, members=None, without=None, steps=None, online_share):
+    def sample(batch_size, *, tags, members=None, without=None, steps=None, online_fraction):
         assert without is None
         assert steps is None
-        assert online_share == 0.25
+        assert online_fraction == 0.25
         drawn[current] = ({tag.name.lower() for tag in tags}, members)
         raise KeyboardInterrupt
 
@@ -83,7 +83,7 @@ def test_undecided_episodes_count_as_the_setting_says_online_alone(config):
     buffer.encode(agent.encoder)
     rows = Training(agent, buffer, config, Silent()).safe_set.sample()
     assert "safe_set_weight" not in rows  # as in the paper
-    OmegaConf.update(config, "loss.undecided_weight", 0.25)
+    OmegaConf.update(config, "loss.timed_out_weight", 0.25)
     OmegaConf.update(config, "optim.batch_size", 400)
     rows = Training(agent, buffer, config, Silent()).safe_set.sample()
     outcome = [rows["next", key].flatten() for key in ("success", "constraint")]
@@ -110,10 +110,10 @@ def test_failures_are_violating_demonstrations_at_the_value_of_failure(config):
         buffer.add(episode, tag)
     buffer.encode(agent.encoder)
     training = Training(agent, buffer, config, Silent())
-    rows = training.value.beside.sample()
+    rows = training.value.auxiliary.sample()
     assert (rows["tag"] == int(Tag.CONSTRAINT)).all()
     assert (rows["reward_to_go"] == -42.0).all()
-    assert training.value.beside.weight == 0.5
+    assert training.value.auxiliary.weight == 0.5
     # The buffer itself keeps the returns that were seen.
     assert (buffer.sample(50, tags=["constraint"])["reward_to_go"] > -42.0).all()
 
@@ -128,7 +128,7 @@ def test_failures_may_be_the_violating_states_alone_and_have_the_value_of_an_epi
     buffer.add(TensorDict({"pixels": step["pixels"], "action": torch.zeros(9, 2), "next": step}, [9]), "constraint")
     buffer.encode(agent.encoder)
     training = Training(agent, buffer, config, Silent(), horizon=3)
-    rows = training.value.beside.sample()
+    rows = training.value.auxiliary.sample()
     assert rows.batch_size == (4, agent.value.num_members)
     assert rows["next", "constraint"].all()
     assert torch.equal(rows["latent"], rows["next", "latent"])

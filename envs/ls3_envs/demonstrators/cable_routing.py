@@ -22,7 +22,7 @@ class CableDemonstrator(Scripted):
     Example:
         >>> from torchrl.envs import InitTracker, TransformedEnv
         >>> from ls3_envs import CableRoutingEnv
-        >>> env = TransformedEnv(CableRoutingEnv(num_worlds=2, seed=0), InitTracker())
+        >>> env = TransformedEnv(CableRoutingEnv(num_envs=2, seed=0), InitTracker())
         >>> bool(env.rollout(50, CableDemonstrator(seed=0))["next", "success"].any(dim=1).all())
         True
     """

@@ -19,7 +19,7 @@ class NavigationDemonstrator(Scripted):
     Example:
         >>> from torchrl.envs import InitTracker, TransformedEnv
         >>> from ls3_envs import NavigationEnv
-        >>> env = TransformedEnv(NavigationEnv(num_worlds=4, seed=0), InitTracker())
+        >>> env = TransformedEnv(NavigationEnv(num_envs=4, seed=0), InitTracker())
         >>> episodes = env.rollout(100, NavigationDemonstrator(seed=0))
         >>> bool(episodes["next", "success"].any(dim=1).all())
         True
@@ -48,7 +48,7 @@ class NavigationViolator(Scripted):
     Example:
         >>> from torchrl.envs import InitTracker, TransformedEnv
         >>> from ls3_envs import NavigationEnv
-        >>> env = TransformedEnv(NavigationEnv(num_worlds=4, start="random", seed=0), InitTracker())
+        >>> env = TransformedEnv(NavigationEnv(num_envs=4, start="random", seed=0), InitTracker())
         >>> episodes = env.rollout(100, NavigationViolator(seed=0))
         >>> bool(episodes["next", "constraint"][:, -1].all())
         True

@@ -49,7 +49,7 @@ class PushingDemonstrator(Scripted):
     Example:
         >>> from torchrl.envs import InitTracker, TransformedEnv
         >>> from ls3_envs import SequentialPushingEnv
-        >>> env = TransformedEnv(SequentialPushingEnv(num_worlds=2, seed=0), InitTracker())
+        >>> env = TransformedEnv(SequentialPushingEnv(num_envs=2, seed=0), InitTracker())
         >>> episodes = env.rollout(100, PushingDemonstrator(seed=0))
         >>> bool(episodes["next", "success"].any(dim=1).all())
         True
@@ -84,7 +84,7 @@ class PushingViolator(Scripted):
     Example:
         >>> from torchrl.envs import InitTracker, TransformedEnv
         >>> from ls3_envs import SequentialPushingEnv
-        >>> env = TransformedEnv(SequentialPushingEnv(num_worlds=2, start="random", seed=0), InitTracker())
+        >>> env = TransformedEnv(SequentialPushingEnv(num_envs=2, start="random", seed=0), InitTracker())
         >>> env.rollout(3, PushingViolator(seed=0)).batch_size
         torch.Size([2, 3])
     """

@@ -21,7 +21,7 @@ class ReacherDemonstrator(Scripted):
     Example:
         >>> from torchrl.envs import InitTracker, TransformedEnv
         >>> from ls3_envs import ReacherEnv
-        >>> env = TransformedEnv(ReacherEnv(num_worlds=2, seed=0), InitTracker())
+        >>> env = TransformedEnv(ReacherEnv(num_envs=2, seed=0), InitTracker())
         >>> episodes = env.rollout(10, ReacherDemonstrator(seed=0))
         >>> bool(episodes["next", "constraint"].any())
         False
@@ -48,7 +48,7 @@ class ReacherViolator(Scripted):
     Example:
         >>> from torchrl.envs import InitTracker, TransformedEnv
         >>> from ls3_envs import ReacherEnv
-        >>> env = TransformedEnv(ReacherEnv(num_worlds=4, start="random", seed=0), InitTracker())
+        >>> env = TransformedEnv(ReacherEnv(num_envs=4, start="random", seed=0), InitTracker())
         >>> env.rollout(3, ReacherViolator(seed=0)).batch_size
         torch.Size([4, 3])
     """
@@ -78,7 +78,7 @@ class ReacherWanderer(Scripted):
     Example:
         >>> from torchrl.envs import InitTracker, TransformedEnv
         >>> from ls3_envs import ReacherEnv
-        >>> env = TransformedEnv(ReacherEnv(num_worlds=4, start="random", seed=0), InitTracker())
+        >>> env = TransformedEnv(ReacherEnv(num_envs=4, start="random", seed=0), InitTracker())
         >>> env.rollout(3, ReacherWanderer(seed=0)).batch_size
         torch.Size([4, 3])
     """

@@ -27,7 +27,7 @@ class MujocoEnv(VisualConstraintEnv):
     """N worlds of one MuJoCo model, each a row of positions and velocities in float64.
 
     What the state is after a step depends on the world's own state, action and random stream alone. With C MuJoCo
-    and either renderer, the same seed gives the same bits whatever ``num_worlds`` and ``threads`` are; MuJoCo Warp
+    and either renderer, the same seed gives the same bits whatever ``num_envs`` and ``threads`` are; MuJoCo Warp
     computes in float32 and follows it closely.
 
     A world whose physics blows up goes back to its last good state, ends its episode (``truncated``) and says so under
@@ -37,7 +37,7 @@ class MujocoEnv(VisualConstraintEnv):
         model: compiled.
         camera: name of the camera that the pictures are taken with.
         groups: geom groups that it sees.
-        num_worlds: N.
+        num_envs: N.
         action_low: smallest action per axis.
         action_high: largest action per axis.
         horizon: steps in an episode.
@@ -59,7 +59,7 @@ class MujocoEnv(VisualConstraintEnv):
         camera: str,
         *,
         groups: tuple[int, ...] = (0, 1, 2),
-        num_worlds: int,
+        num_envs: int,
         action_low: Sequence[float],
         action_high: Sequence[float],
         horizon: int,
@@ -71,7 +71,7 @@ class MujocoEnv(VisualConstraintEnv):
         seed: int | None = None,
     ) -> None:
         super().__init__(
-            num_worlds=num_worlds,
+            num_envs=num_envs,
             state_dim=model.nq + model.nv,
             action_low=action_low,
             action_high=action_high,
@@ -81,11 +81,11 @@ class MujocoEnv(VisualConstraintEnv):
             seed=seed,
         )
         self.model = model
-        self.physics = make_physics(physics, model, num_worlds=num_worlds, device=self.device, threads=threads)
+        self.physics = make_physics(physics, model, num_envs=num_envs, device=self.device, threads=threads)
         self.renderer = make_renderer(
-            renderer, model, camera, size=image_size, num_worlds=num_worlds, device=self.device, groups=groups
+            renderer, model, camera, size=image_size, num_envs=num_envs, device=self.device, groups=groups
         )
-        self.observation_spec["physics_error"] = Binary(shape=(num_worlds, 1), dtype=torch.bool, device=self.device)
+        self.observation_spec["physics_error"] = Binary(shape=(num_envs, 1), dtype=torch.bool, device=self.device)
         self._state = self._state.double()
         self._broken = torch.zeros_like(self._frozen)
         self._seen: tuple[Tensor, View] | None = None

@@ -72,11 +72,11 @@ class WarpPhysics:
 
     Args:
         model: compiled; see MuJoCo Warp's documentation for what it does not support.
-        num_worlds: N.
+        num_envs: N.
         device: of PyTorch, whose counterpart Warp computes on.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_worlds: int, device: torch.device) -> None:
+    def __init__(self, model: mujoco.MjModel, num_envs: int, device: torch.device) -> None:
         from ls3_envs.mujoco._warp import mjw, wp, wp_device
 
         self.model, self._wp = model, wp
@@ -84,7 +84,7 @@ class WarpPhysics:
         with wp.ScopedDevice(self._device):
             self._model = mjw.put_model(model)
             # Room for the contacts of every world, not only for those of the first pose.
-            self._data = mjw.put_data(model, mujoco.MjData(model), nworld=num_worlds, nconmax=64, njmax=256)
+            self._data = mjw.put_data(model, mujoco.MjData(model), nworld=num_envs, nconmax=64, njmax=256)
         self._step = mjw.step
 
     def __call__(self, state: Tensor, control: Tensor) -> Tensor:
@@ -102,7 +102,7 @@ class WarpPhysics:
 
 
 def make_physics(
-    name: str, model: mujoco.MjModel, *, num_worlds: int, device: torch.device, threads: int | None
+    name: str, model: mujoco.MjModel, *, num_envs: int, device: torch.device, threads: int | None
 ) -> Physics:
     """The back end ``"mujoco"`` or ``"warp"``.
 
@@ -112,5 +112,5 @@ def make_physics(
     if name == "mujoco":
         return MujocoPhysics(model, threads=threads)
     if name == "warp":
-        return WarpPhysics(model, num_worlds, device)
+        return WarpPhysics(model, num_envs, device)
     raise ValueError(f"physics must be one of {', '.join(map(repr, PHYSICS))}, got {name!r}.")

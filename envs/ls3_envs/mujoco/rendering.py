@@ -52,7 +52,7 @@ class RayTracer:
         model: compiled.
         camera: name of the camera.
         size: side of the image in pixels, 8 to 1024.
-        num_worlds: worlds drawn in one call; other numbers are drawn in several.
+        num_envs: worlds drawn in one call; other numbers are drawn in several.
         device: of PyTorch, whose counterpart Warp draws on.
         groups: geom groups that are seen.
     """
@@ -63,23 +63,23 @@ class RayTracer:
         camera: str,
         *,
         size: int = 64,
-        num_worlds: int = 1,
+        num_envs: int = 1,
         device: torch.device | str = "cpu",
         groups: tuple[int, ...] = (0, 1, 2),
     ) -> None:
         from ls3_envs.mujoco._warp import mjw, wp, wp_device
 
         number = check_camera(model, camera, size)
-        self.size, self.num_worlds = size, num_worlds
+        self.size, self.num_envs = size, num_envs
         self._mjw, self._wp, self._device = mjw, wp, wp_device(torch.device(device))
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)  # a fixed camera has its pose only after it
         with wp.ScopedDevice(self._device):
             self._model = mjw.put_model(model)
-            self._data = mjw.put_data(model, data, nworld=num_worlds)
+            self._data = mjw.put_data(model, data, nworld=num_envs)
             self._context = mjw.create_render_context(
                 model,
-                nworld=num_worlds,
+                nworld=num_envs,
                 cam_res=(size, size),
                 render_rgb=True,
                 render_depth=False,
@@ -94,7 +94,7 @@ class RayTracer:
 
     def __call__(self, qpos: Tensor) -> View:
         """The view of poses ``[n, nq]``."""
-        n, worlds = len(qpos), self.num_worlds
+        n, worlds = len(qpos), self.num_envs
         if n == worlds:
             return self._draw(qpos)
         missing = -n % worlds
@@ -112,7 +112,7 @@ class RayTracer:
             mjw.render(self._model, self._data, self._context)
             packed = wp.to_torch(self._context.rgb_data).view(torch.uint8)
             seen = wp.to_torch(self._context.seg_data)
-        shape = (self.num_worlds, self.size, self.size)
+        shape = (self.num_envs, self.size, self.size)
         bgra = packed.reshape(*shape, 4)
         geoms = seen.reshape(*shape, -1)[..., 0].long()
         return View(bgra[..., [2, 1, 0]].permute(0, 3, 1, 2).contiguous(), geoms)
@@ -180,7 +180,7 @@ def make_renderer(
     camera: str,
     *,
     size: int,
-    num_worlds: int,
+    num_envs: int,
     device: torch.device,
     groups: tuple[int, ...] = (0, 1, 2),
 ) -> Renderer:
@@ -191,7 +191,7 @@ def make_renderer(
         RuntimeError: when EGL is asked for where it does not work.
     """
     if name == "raytrace":
-        return RayTracer(model, camera, size=size, num_worlds=num_worlds, device=device, groups=groups)
+        return RayTracer(model, camera, size=size, num_envs=num_envs, device=device, groups=groups)
     if name == "egl":
         return EGLRenderer(model, camera, size=size, groups=groups)
     raise ValueError(f"renderer must be one of {', '.join(map(repr, RENDERERS))}, got {name!r}.")

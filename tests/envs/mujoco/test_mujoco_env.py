@@ -15,7 +15,7 @@ def play(env, steps=4, seed=3):
     generator, td, out = torch.Generator().manual_seed(seed), env.reset(), []
     space = env.action_spec.space
     for _ in range(steps):
-        draws = torch.rand(4, 2, generator=generator)[: env.num_worlds]
+        draws = torch.rand(4, 2, generator=generator)[: env.num_envs]
         td = env.step(td.set("action", space.low + (space.high - space.low) * draws))
         out.append(td)
         td = step_mdp(td)
@@ -24,25 +24,25 @@ def play(env, steps=4, seed=3):
 
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_specs(domain):
-    check_env_specs(domain(num_worlds=2, seed=0))
+    check_env_specs(domain(num_envs=2, seed=0))
 
 
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_the_same_seed_gives_the_same_bits_whatever_the_batch_and_threads(domain):
-    whole = play(domain(num_worlds=4, threads=1, seed=5))
-    few = play(domain(num_worlds=2, threads=2, seed=5))
+    whole = play(domain(num_envs=4, threads=1, seed=5))
+    few = play(domain(num_envs=2, threads=2, seed=5))
     for key in ("state", "pixels", "constraint", "success"):
         assert torch.equal(few["next", key], whole["next", key][:2]), key
-    assert not torch.equal(play(domain(num_worlds=2, seed=6))["state"], few["state"]) or domain is ReacherEnv
+    assert not torch.equal(play(domain(num_envs=2, seed=6))["state"], few["state"]) or domain is ReacherEnv
 
 
 def test_warp_physics_lives_almost_the_same_life():
-    exact, warp = (play(ReacherEnv(num_worlds=2, physics=name, seed=0), steps=8) for name in ("mujoco", "warp"))
+    exact, warp = (play(ReacherEnv(num_envs=2, physics=name, seed=0), steps=8) for name in ("mujoco", "warp"))
     torch.testing.assert_close(warp["next", "state"], exact["next", "state"], atol=1e-4, rtol=1e-3)
 
 
 def test_a_blow_up_ends_one_worlds_episode_and_no_others():
-    env, other = (ReacherEnv(num_worlds=3, seed=0) for _ in range(2))
+    env, other = (ReacherEnv(num_envs=3, seed=0) for _ in range(2))
     td, same = env.reset(), other.reset()
     zero = torch.zeros(3, 2)
     env._state[1, 2] = 1e9  # a speed that no arm has
@@ -61,7 +61,7 @@ def test_a_blow_up_ends_one_worlds_episode_and_no_others():
 
 
 def test_a_nan_state_goes_back_to_the_last_good_one():
-    env = ReacherEnv(num_worlds=2, seed=0)
+    env = ReacherEnv(num_envs=2, seed=0)
     td = env.reset()
     good = env._state.clone()
     env.physics = lambda state, control: torch.where(torch.tensor([[True], [False]]), torch.nan, state)
@@ -72,7 +72,7 @@ def test_a_nan_state_goes_back_to_the_last_good_one():
 
 
 def test_a_violation_freezes_the_world():
-    env = ReacherEnv(num_worlds=2, seed=0)
+    env = ReacherEnv(num_envs=2, seed=0)
     td = env.reset()
 
     env._state[0] = on_the_obstacle()
@@ -94,7 +94,7 @@ def on_the_obstacle() -> torch.Tensor:
 
 
 def test_one_picture_is_drawn_for_all_questions_about_a_state():
-    env = CableRoutingEnv(num_worlds=1, seed=0)
+    env = CableRoutingEnv(num_envs=1, seed=0)
     draw, calls = env.renderer, []
     env.renderer = lambda qpos: (calls.append(1), draw(qpos))[1]
     td = env.reset()
@@ -104,13 +104,13 @@ def test_one_picture_is_drawn_for_all_questions_about_a_state():
 
 
 def test_stepping_before_the_first_reset_is_refused():
-    env = ReacherEnv(num_worlds=1, seed=0)
+    env = ReacherEnv(num_envs=1, seed=0)
     with pytest.raises(RuntimeError, match=r"before its first reset.*env\.reset\(\)"):
         env._step(env.fake_tensordict())
 
 
 def test_actions_of_another_shape_are_refused():
-    env = ReacherEnv(num_worlds=2, seed=0)
+    env = ReacherEnv(num_envs=2, seed=0)
     td = env.reset()
     with pytest.raises(ValueError, match=r"shape \[2, 2\], one row for each world; got \[2, 3\]"):
         env.step(td.set("action", torch.zeros(2, 3)))

@@ -81,4 +81,4 @@ def test_what_the_state_does_not_hold_is_refused():
 
 def test_an_unknown_back_end_is_answered_with_the_known_ones():
     with pytest.raises(ValueError, match="'mujoco', 'warp', got 'bullet'"):
-        make_physics("bullet", reacher_model(), num_worlds=1, device=torch.device("cpu"), threads=1)
+        make_physics("bullet", reacher_model(), num_envs=1, device=torch.device("cpu"), threads=1)

@@ -34,7 +34,7 @@ def model() -> mujoco.MjModel:
 
 
 def test_a_box_is_where_it_stands_and_what_is_not_shown_hides_nothing():
-    view = RayTracer(model(), "above", num_worlds=2)(torch.tensor([[0.0, 0.0], [0.3, 0.3]]))
+    view = RayTracer(model(), "above", num_envs=2)(torch.tensor([[0.0, 0.0], [0.3, 0.3]]))
     assert view.pixels.shape == (2, 3, 64, 64)
     assert view.pixels.dtype == torch.uint8
     red = view.pixels[:, 0] > view.pixels[:, 2]
@@ -50,9 +50,9 @@ def test_a_box_is_where_it_stands_and_what_is_not_shown_hides_nothing():
 
 def test_a_picture_is_the_same_in_any_batch():
     poses = 0.3 * torch.randn(5, 2)
-    whole = RayTracer(model(), "above", num_worlds=5)(poses)
+    whole = RayTracer(model(), "above", num_envs=5)(poses)
     for worlds in (1, 3):
-        parts = RayTracer(model(), "above", num_worlds=worlds)(poses)
+        parts = RayTracer(model(), "above", num_envs=worlds)(poses)
         assert torch.equal(parts.pixels, whole.pixels)
         assert torch.equal(parts.geoms, whole.geoms)
 
@@ -73,7 +73,7 @@ def test_what_cannot_be_drawn_is_refused(options, message):
             model(),
             arguments["camera"],
             size=arguments["size"],
-            num_worlds=1,
+            num_envs=1,
             device=torch.device("cpu"),
         )
 
@@ -81,7 +81,7 @@ def test_what_cannot_be_drawn_is_refused(options, message):
 def test_egl_must_be_chosen_before_mujoco_is_imported(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     with pytest.raises(RuntimeError, match=r"MUJOCO_GL=egl.*renderer=\"raytrace\""):
-        make_renderer("egl", model(), "above", size=64, num_worlds=1, device=torch.device("cpu"))
+        make_renderer("egl", model(), "above", size=64, num_envs=1, device=torch.device("cpu"))
 
 
 def in_a_fresh_process(code: str, **environment: str) -> subprocess.CompletedProcess:
@@ -109,7 +109,7 @@ def test_every_domain_runs_without_any_rendering_library():
         ctypes.util.find_library = lambda name: None if name in ("GL", "EGL", "OSMesa", "OpenGL") else find(name)
         import ls3_envs
         for name in ls3_envs.DOMAINS:
-            assert ls3_envs.make(name, num_worlds=1, seed=0).rollout(2)["next", "pixels"].float().std() > 0, name
+            assert ls3_envs.make(name, num_envs=1, seed=0).rollout(2)["next", "pixels"].float().std() > 0, name
         maps = open("/proc/self/maps").read()
         assert not any(f"/{word}.so" in maps for word in ("libGL", "libEGL", "libOSMesa"))
         """,
@@ -125,11 +125,11 @@ def test_both_renderers_show_the_same_scene():
         import torch
         from ls3_envs.reacher import ReacherEnv
         try:
-            egl = ReacherEnv(num_worlds=2, renderer="egl", seed=0)
+            egl = ReacherEnv(num_envs=2, renderer="egl", seed=0)
         except RuntimeError as error:
             assert "raytrace" in str(error)
             raise SystemExit(77)
-        traced = ReacherEnv(num_worlds=2, seed=0)
+        traced = ReacherEnv(num_envs=2, seed=0)
         one, other = (env.reset()["pixels"].float() for env in (egl, traced))
         assert (one - other).abs().mean() < 2.0, (one - other).abs().mean()
         """,

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 
-def evaluate(
+def call_on_latent(
     network: TensorDictModuleBase, latent: Tensor, *, params: TensorDictParams | None = None, **options: bool
 ) -> Tensor:
     """The first output of a module of one latent, whatever its keys are called.
