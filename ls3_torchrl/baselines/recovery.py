@@ -18,7 +18,7 @@ from torchrl.objectives import LossModule
 from ls3_torchrl._checks import require_keys
 from ls3_torchrl.baselines.networks import ObservedAction
 from ls3_torchrl.modules.ensemble import EnsembleMLP
-from ls3_torchrl.objectives._call import as_scalars
+from ls3_torchrl.objectives._common import as_scalars
 from ls3_torchrl.objectives.value import check_discount
 
 

@@ -9,8 +9,9 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from torchrl.objectives import LossModule
 
 from ls3_torchrl._checks import require_keys
+from ls3_torchrl.modules.call import call_on_latent
 from ls3_torchrl.modules.classifiers import LatentClassifier
-from ls3_torchrl.objectives._call import as_scalars, call_on_latent
+from ls3_torchrl.objectives._common import as_scalars
 
 
 class ClassifierLoss(LossModule):

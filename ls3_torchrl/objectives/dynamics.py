@@ -10,7 +10,7 @@ from torchrl.objectives import LossModule
 
 from ls3_torchrl._checks import require_at_least, require_keys
 from ls3_torchrl.modules.dynamics import EnsembleDynamics
-from ls3_torchrl.objectives._call import as_scalars, check_members
+from ls3_torchrl.objectives._common import as_scalars, check_members
 
 
 class EnsembleDynamicsLoss(LossModule):

@@ -11,7 +11,7 @@ from torchrl.objectives import LossModule
 from ls3_torchrl._checks import require_keys
 from ls3_torchrl.modules.dynamics import EnsembleDynamics
 from ls3_torchrl.modules.vae import PixelEncoder
-from ls3_torchrl.objectives._call import as_scalars
+from ls3_torchrl.objectives._common import as_scalars
 
 
 class LatentPredictionLoss(LossModule):

@@ -13,7 +13,7 @@ from torchrl.objectives import LossModule
 
 from ls3_torchrl._checks import require_choice, require_keys
 from ls3_torchrl.modules.vae import PixelDecoder, PixelEncoder, as_unit_pixels
-from ls3_torchrl.objectives._call import as_scalars
+from ls3_torchrl.objectives._common import as_scalars
 
 
 class VAELoss(LossModule):

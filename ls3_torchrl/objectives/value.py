@@ -12,8 +12,9 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import td0_return_estimate
 
 from ls3_torchrl._checks import require_keys
+from ls3_torchrl.modules.call import call_on_latent
 from ls3_torchrl.modules.value import ValueEnsemble
-from ls3_torchrl.objectives._call import as_scalars, call_on_latent, check_members
+from ls3_torchrl.objectives._common import as_scalars, check_members
 
 
 def check_discount(gamma: float, name: str = "gamma") -> float:
