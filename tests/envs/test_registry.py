@@ -10,7 +10,7 @@ from ls3_envs import DOMAINS, NavigationEnv, VisualConstraintEnv, collect_offlin
 def test_navigation_is_in_the_table_with_the_papers_numbers():
     row = domain("navigation")
     assert row is DOMAINS["navigation"]
-    assert row.env is NavigationEnv
+    assert row.env.load() is NavigationEnv
     # 50 demonstrations, 50 violating trajectories, and no additional random data (section 1.3.1).
     assert {kind: data.episodes for kind, data in row.offline.items()} == {"success": 50, "constraint": 50}
 
