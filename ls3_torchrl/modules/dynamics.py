@@ -16,22 +16,6 @@ from ls3_torchrl.modules.ensemble import EnsembleMLP
 Propagation = Literal["ts1", "tsinf"]
 
 
-def sample_members(num_rows: int, num_members: int, *, device: torch.device | None = None) -> Tensor:
-    """The member that moves each row, int64 ``[num_rows]`` in 0…M−1: as even a split as can be, in random order.
-
-    Args:
-        num_rows: how many rows, or particles, there are.
-        num_members: M.
-        device: where to draw.
-
-    Example:
-        >>> sample_members(10, 5).bincount().tolist()
-        [2, 2, 2, 2, 2]
-    """
-    order = torch.randperm(num_rows, device=device) % num_members
-    return torch.randperm(num_members, device=device)[order]
-
-
 class EnsembleDynamics(TensorDictModuleBase):
     """M networks, each a Gaussian over the next latent: N(z + Δ_m(z, a), σ_m(z, a)²).
 
@@ -178,9 +162,10 @@ class EnsembleDynamics(TensorDictModuleBase):
             scales.append(scale)
         return torch.stack(means, -2), torch.stack(scales, -2)
 
-    def draw_members(self, num_rows: int, *, device: torch.device | None = None) -> Tensor:
+    def sample_members(self, num_rows: int, *, device: torch.device | None = None) -> Tensor:
         """Members for ``num_rows`` particles, int64 ``[num_rows]``: as even a split as can be, in random order."""
-        return sample_members(num_rows, self.num_members, device=device)
+        order = torch.randperm(num_rows, device=device) % self.num_members
+        return torch.randperm(self.num_members, device=device)[order]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Move every row by one member and write the next latent."""
@@ -188,7 +173,7 @@ class EnsembleDynamics(TensorDictModuleBase):
         latent, action = (tensordict.get(key) for key in self.in_keys)
         members = tensordict.get(self.member_key, None)
         if members is None:
-            members = self.draw_members(latent[..., 0].numel(), device=latent.device)
+            members = self.sample_members(latent[..., 0].numel(), device=latent.device)
             members = members.reshape(*latent.shape[:-1], 1)
             if self.propagation == "tsinf":
                 tensordict.set(self.member_key, members)

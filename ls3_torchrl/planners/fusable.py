@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 from torch import nn
 
 from ls3_torchrl.layers import is_relu_mlp
@@ -63,14 +65,12 @@ def _of_module(name: str, module: nn.Module, kind: type) -> str | None:
 
 
 def _of_network(name: str, module: nn.Module) -> str | None:
-    network = module.network
-    if isinstance(module, LatentClassifier):
-        plain = is_relu_mlp(network)
-    else:
-        plain = type(network) is EnsembleMLP
-    if plain and not any("forward" in vars(part) for part in network.modules()):
-        return None if not any(map(_has_hooks, network.modules())) else f"{name}'s network has forward hooks"
-    return f"{name} ({type(module).__name__}) has a network of another kind than its own, {type(network).__name__}"
+    network = cast(nn.Module, module.network)
+    plain = is_relu_mlp(network) if isinstance(module, LatentClassifier) else type(network) is EnsembleMLP
+    if not plain or any("forward" in vars(part) for part in network.modules()):
+        kind = type(network).__name__
+        return f"{name} ({type(module).__name__}) has a network of another kind than its own, of type {kind}"
+    return f"{name}'s network has forward hooks" if any(map(_has_hooks, network.modules())) else None
 
 
 def _has_hooks(module: nn.Module) -> bool:

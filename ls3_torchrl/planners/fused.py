@@ -9,12 +9,11 @@ from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from ls3_torchrl._checks import require_choice
 from ls3_torchrl.layers import Precision, run_layers
-from ls3_torchrl.modules.classifiers import LatentClassifier
-from ls3_torchrl.modules.value import ValueEnsemble
 from ls3_torchrl.planners.fusable import require_fusable, why_not_fused
 from ls3_torchrl.planners.imagination import ImaginationNoise, Limits
 from ls3_torchrl.planners.latent_env import LatentEnv
@@ -85,8 +84,8 @@ class FusedImagination:
     def __init__(
         self,
         env: LatentEnv,
-        value: ValueEnsemble,
-        safe_set: LatentClassifier,
+        value: TensorDictModuleBase,
+        safe_set: TensorDictModuleBase,
         *,
         constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",

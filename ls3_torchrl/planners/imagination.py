@@ -11,7 +11,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ls3_torchrl.modules.call import call_on_latent
-from ls3_torchrl.modules.dynamics import sample_members
 from ls3_torchrl.planners.latent_env import LatentEnv, probability_of
 from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction
 
@@ -53,26 +52,6 @@ class PlanNoise(NamedTuple):
         return ImaginationNoise(self.members[iteration], self.dynamics[iteration][rows])
 
 
-def sample_imagination_noise(
-    env: LatentEnv, rows: int, horizon: int, particles: int, candidates: int, *, device: torch.device | None = None
-) -> ImaginationNoise:
-    """Members and noise for ``rows`` plans: an even split of the particles, anew at each step or once under TS-∞.
-
-    Args:
-        env: the learned model; dynamics that are no ensemble have one member.
-        rows: b.
-        horizon: H.
-        particles: P.
-        candidates: N for noise of each candidate's own; 1 for noise that a row's candidates share.
-        device: where to draw.
-    """
-    if env.fixed_members:
-        members = sample_members(particles, env.num_members, device=device).expand(horizon, -1)
-    else:
-        members = torch.stack([sample_members(particles, env.num_members, device=device) for _ in range(horizon)])
-    return ImaginationNoise(members, torch.randn(rows, horizon, particles, candidates, env.latent_dim, device=device))
-
-
 class Limits(NamedTuple):
     """What makes a plan feasible.
 
@@ -98,6 +77,30 @@ class Imagination(Protocol):
 
         With ``limits``, value and goal of infeasible plans may be left out (NaN): nothing depends on them.
         """
+
+
+def sample_imagination_noise(
+    env: LatentEnv, rows: int, horizon: int, particles: int, candidates: int, *, device: torch.device | None = None
+) -> ImaginationNoise:
+    """Members and noise for ``rows`` plans: an even split of the particles, anew at each step or once under TS-∞.
+
+    Args:
+        env: the learned model; dynamics that are no ensemble have one member.
+        rows: b.
+        horizon: H.
+        particles: P.
+        candidates: N for noise of each candidate's own; 1 for noise that a row's candidates share.
+        device: where to draw.
+    """
+
+    def members() -> Tensor:
+        if hasattr(env.dynamics, "sample_members"):
+            return env.dynamics.sample_members(particles, device=device)
+        return torch.zeros(particles, dtype=torch.long, device=device)
+
+    over_time = members().expand(horizon, -1) if env.fixed_members else torch.stack([members() for _ in range(horizon)])
+    noise = torch.randn(rows, horizon, particles, candidates, env.latent_dim, device=device)
+    return ImaginationNoise(over_time, noise)
 
 
 class RolloutImagination:

@@ -14,7 +14,6 @@ from torchrl.envs import ModelBasedEnvBase
 from ls3_torchrl._checks import require_at_least
 from ls3_torchrl.modules.call import call_on_latent
 from ls3_torchrl.modules.classifiers import LatentClassifier
-from ls3_torchrl.modules.dynamics import sample_members
 
 
 class LatentEnv(ModelBasedEnvBase):
@@ -113,11 +112,6 @@ class LatentEnv(ModelBasedEnvBase):
         return next(parameters, torch.float32)
 
     @property
-    def num_members(self) -> int:
-        """M, members of the dynamics; 1 for dynamics that are no ensemble."""
-        return getattr(self.dynamics, "num_members", 1)
-
-    @property
     def fixed_members(self) -> bool:
         """Whether a particle keeps the member that it drew first (TS-∞)."""
         return getattr(self.dynamics, "propagation", "ts1") == "tsinf"
@@ -139,7 +133,7 @@ class LatentEnv(ModelBasedEnvBase):
             members = tensordict.get(key, None)
             if members is None:
                 rows = out.batch_size.numel()
-                members = sample_members(rows, self.num_members, device=self.device).reshape(*out.batch_size, 1)
+                members = self.dynamics.sample_members(rows, device=self.device).reshape(*out.batch_size, 1)
             out.set(key, members)
         return out
 

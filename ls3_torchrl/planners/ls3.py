@@ -174,7 +174,10 @@ class LS3Planner(MPCPlannerBase):
         require_choice(engine, ("auto", "fused", "rollout"), "engine")
         require_choice(precision, ("auto", "fp32", "bf16"), "precision")
         self.engine: Engine = engine
-        self._reductions = {"constraint_reduction": constraint_reduction, "safe_set_reduction": safe_set_reduction}
+        self._reductions: dict[str, Any] = {
+            "constraint_reduction": constraint_reduction,
+            "safe_set_reduction": safe_set_reduction,
+        }
         self._rollout = RolloutImagination(model, value, safe_set, **self._reductions)
         self._fused: FusedImagination | None = None
         self._precision: Precision = precision
@@ -213,8 +216,9 @@ class LS3Planner(MPCPlannerBase):
         elif not FusedImagination.supports(self.env, self.value, self.safe_set):
             return self._rollout
         if self._fused is None:
-            parts = (self.env, self.value, self.safe_set)
-            self._fused = FusedImagination(*parts, precision=self._precision, **self._reductions)
+            self._fused = FusedImagination(
+                self.env, self.value, self.safe_set, precision=self._precision, **self._reductions
+            )
         return self._fused
 
     def sample_noise(self, batch: int) -> PlanNoise:

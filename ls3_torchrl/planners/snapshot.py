@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -73,7 +73,7 @@ class Snapshot:
             for weight, bias in zip(dynamics.weights, dynamics.biases, strict=True)
         ]
         self.value = members_of(self._value.network, self.dtype)
-        self.heads = {name: layers_of(head.network, self.dtype) for name, head in self._heads.items()}
+        self.heads = {name: layers_of(cast(nn.Module, head.network), self.dtype) for name, head in self._heads.items()}
         self._seen = [p.detach().clone() for p in parameters]
         return True
 

@@ -7,10 +7,10 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.data import Bounded
 
+from ls3_torchrl.layers import fastest_precision
 from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
 from ls3_torchrl.planners import FusedImagination, ImaginationNoise, LatentEnv, RolloutImagination, feasible
 from ls3_torchrl.planners.imagination import Limits
-from ls3_torchrl.layers import fastest_precision
 
 D, A, M = 4, 2, 3
 B, N, H, P = 2, 7, 3, 4
