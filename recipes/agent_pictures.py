@@ -107,7 +107,7 @@ def plans(
         draws = torch.rand(1, candidates, horizon, space.low.shape[-1], device=latent.device)
         actions = space.low + (space.high - space.low) * draws
         verdict = planner.score_plans(
-            planner.statistics(latent, actions),
+            planner.imagine_plans(latent, actions),
             torch.full((1, 1), planner.safe_set_threshold, device=latent.device),
         )
         chosen = planner.plan(latent).actions

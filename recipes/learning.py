@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 
 from common import RunFolder, progress
-from ls3_torchrl.planners.layers import fastest_precision
+from ls3_torchrl.layers import fastest_precision
 
 LOG_EVERY = 100
 

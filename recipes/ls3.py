@@ -54,7 +54,7 @@ class LS3(Algorithm):
 
     def prepare(self, env: TransformedEnv) -> None:
         """The planner carries its last plan on from step to step."""
-        env.append_transform(self.policy.primer())
+        env.append_transform(self.policy.make_tensordict_primer())
 
     def make_buffer(self, device: torch.device, **labels: Any) -> TaggedReplayBuffer:
         """Failures may go on for ever in its returns."""

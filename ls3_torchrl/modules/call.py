@@ -20,7 +20,7 @@ def call_on_latent(
         params: weights to use instead of the module's own.
         options: passed on to the module.
     """
-    entry = TensorDict({network.in_keys[0]: latent}, batch_size=latent.shape[:1])
+    entry = TensorDict({network.in_keys[0]: latent}, batch_size=latent.shape[:-1])
     if params is None:
         return network(entry, **options).get(network.out_keys[0])
     # Not params.to_module(): it leaves the lagged copies behind as parameters that ask for gradients.

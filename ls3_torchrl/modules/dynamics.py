@@ -162,7 +162,7 @@ class EnsembleDynamics(TensorDictModuleBase):
             scales.append(scale)
         return torch.stack(means, -2), torch.stack(scales, -2)
 
-    def draw_members(self, num_rows: int, *, device: torch.device | None = None) -> Tensor:
+    def sample_members(self, num_rows: int, *, device: torch.device | None = None) -> Tensor:
         """Members for ``num_rows`` particles, int64 ``[num_rows]``: as even a split as can be, in random order."""
         order = torch.randperm(num_rows, device=device) % self.num_members
         return torch.randperm(self.num_members, device=device)[order]
@@ -173,7 +173,7 @@ class EnsembleDynamics(TensorDictModuleBase):
         latent, action = (tensordict.get(key) for key in self.in_keys)
         members = tensordict.get(self.member_key, None)
         if members is None:
-            members = self.draw_members(latent[..., 0].numel(), device=latent.device)
+            members = self.sample_members(latent[..., 0].numel(), device=latent.device)
             members = members.reshape(*latent.shape[:-1], 1)
             if self.propagation == "tsinf":
                 tensordict.set(self.member_key, members)
