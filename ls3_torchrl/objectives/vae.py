@@ -9,7 +9,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torch.distributions import Normal, kl_divergence
+from torch.distributions import Normal
 from torch.nn.functional import mse_loss
 
 from ls3_torchrl._checks import require_choice
@@ -95,16 +95,16 @@ class VAELoss(LatentLoss):
             # Floats in [0, 1] are as good to it; the same images need not be converted twice.
             pixels = target
         rows = TensorDict({self.encoder.in_keys[0]: pixels}, batch_size=pixels.shape[:1])
-        posterior = Normal(*encode(self.encoder, rows))
-        reconstruction = call_on_latent(self.decoder, posterior.rsample())
+        loc, scale = encode(self.encoder, rows)
+        reconstruction = call_on_latent(self.decoder, Normal(loc, scale).rsample())
         if reconstruction.shape != target.shape:
             raise ValueError(
                 f"The decoder writes images of shape {list(reconstruction.shape)} where the images to reconstruct have "
                 f"shape {list(target.shape)}. Build encoder and decoder for the same images."
             )
 
+        kl = _kl_to_standard_normal(loc, scale)
         # No clamp on the reconstruction: it would stop the gradient of every pixel that starts below zero.
-        kl = kl_divergence(posterior, Normal(torch.zeros_like(posterior.loc), torch.ones_like(posterior.scale)))
         if self.reduction == "mean":
             if target.ndim > 2:
                 # Channels last, as the images lie: PyTorch's gradient would come in another order than they.
@@ -123,3 +123,12 @@ class VAELoss(LatentLoss):
     def _dtype(self) -> torch.dtype:
         """The dtype that the decoder computes in."""
         return next((p.dtype for p in self.decoder.parameters()), torch.float32)
+
+
+def _kl_to_standard_normal(loc: Tensor, scale: Tensor) -> Tensor:
+    """KL(N(loc, scale²) ‖ N(0, 1)) of each dimension.
+
+    ``torch.distributions.kl_divergence`` is not used: the compiler cannot trace how it looks its formula up.
+    """
+    variance = scale.pow(2)
+    return 0.5 * (variance + loc.pow(2) - 1 - variance.log())
