@@ -221,3 +221,23 @@ def test_states_under_keys_of_ones_own_train_as_pixels_do(episode, recorder):
     }
     labels = trainer.goal.sample()[keys.success].float().mean()
     assert 0.0 < labels < 1.0
+
+
+class Scalar(torch.nn.Module):
+    """A single value function, without members."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(8, 1)
+
+    def forward(self, latent):
+        return self.layer(latent)
+
+
+def test_a_value_function_without_members_trains_too(make_agent, filled):
+    value = TensorDictModule(Scalar(), ["latent"], ["state_value"])
+    agent = make_agent(value=value)
+    before = value.module.layer.weight.detach().clone()
+    options = LS3Options(OfflineOptions(2, 2, 2, 2), optim=OPTIM, loss=LossOptions(failure_weight=0.5))
+    LS3Trainer(agent, filled(agent), options, progress=False).train_offline()
+    assert not torch.equal(value.module.layer.weight, before)
