@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ls3_torchrl._checks import require_at_least
-from ls3_torchrl.planners.optimizer import NoiseSource, OptimizerResult, PlanScores, ScorePlans
+from ls3_torchrl.planners.optimizer import NoiseSource, Optimizer, OptimizerResult, PlanScores, ScorePlans
 
 
 class _Elites(NamedTuple):
@@ -242,3 +243,33 @@ class CrossEntropyMethod:
         search.best[rows] = actions[torch.arange(len(rows), device=rows.device), choice]
         search.best_score[rows] = ranking.gather(-1, choice[:, None]).squeeze(-1)
         search.mean[rows], search.std[rows] = search.best[rows], search.start_std[rows]
+
+
+def optimizer_or_default(optimizer: Optimizer | None, settings: dict[str, Any], *, owner: type) -> Optimizer:
+    """The given optimiser, or the cross-entropy method with ``settings``; what fits neither is refused by name.
+
+    Args:
+        optimizer: the user's, if any.
+        settings: what the user passed to ``owner`` beside its own settings.
+        owner: class whose settings the message lists.
+    """
+    known = list(inspect.signature(CrossEntropyMethod).parameters)
+    unknown = [name for name in settings if name not in known]
+    if unknown:
+        own = [name for name, p in inspect.signature(owner).parameters.items() if p.kind is not p.VAR_KEYWORD]
+        raise TypeError(
+            f"{owner.__name__} knows no setting {', '.join(unknown)}. Its own are {', '.join(own)}; those of its "
+            f"optimiser, CrossEntropyMethod, are {', '.join(known)}."
+        )
+    if optimizer is None:
+        return CrossEntropyMethod(**settings)
+    if settings:
+        raise TypeError(
+            f"{', '.join(settings)} are settings of the optimiser: give them to {type(optimizer).__name__}, which was "
+            "passed as optimizer."
+        )
+    if not isinstance(optimizer, Optimizer):
+        needed = ("num_candidates", "uses_warm_start", "max_iterations", "sample_noise", "__call__")
+        missing = [name for name in needed if not hasattr(optimizer, name)]
+        raise TypeError(f"optimizer must be an Optimizer; {type(optimizer).__name__} lacks {', '.join(missing)}.")
+    return optimizer

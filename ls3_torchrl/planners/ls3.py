@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import warnings
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -22,16 +21,14 @@ from ls3_torchrl._checks import (
 )
 from ls3_torchrl.layers import Precision
 from ls3_torchrl.modules.call import posterior_keys
-from ls3_torchrl.planners.cem import CrossEntropyMethod
+from ls3_torchrl.planners.cem import optimizer_or_default
 from ls3_torchrl.planners.decisions import Decisions
-from ls3_torchrl.planners.fusable import require_fusable
-from ls3_torchrl.planners.fused import FusedImagination
+from ls3_torchrl.planners.engine import Engine, EngineName
 from ls3_torchrl.planners.imagination import (
     Imagination,
     ImaginationNoise,
     Limits,
     PlanNoise,
-    RolloutImagination,
     sample_imagination_noise,
 )
 from ls3_torchrl.planners.latent_env import LatentEnv
@@ -46,8 +43,6 @@ from ls3_torchrl.planners.scoring import (
     objective,
 )
 from ls3_torchrl.planners.warm_start import WarmStart
-
-Engine = Literal["auto", "fused", "rollout"]
 
 
 class LS3Planner(MPCPlannerBase):
@@ -119,6 +114,7 @@ class LS3Planner(MPCPlannerBase):
         >>> from torchrl.data import Bounded
         >>> from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet
         >>> from ls3_torchrl.modules import ValueEnsemble
+        >>> from ls3_torchrl.planners import CrossEntropyMethod
         >>> spec = Bounded(low=-1.0, high=1.0, shape=(2,))
         >>> model = LatentEnv(EnsembleDynamics(8, 2), ConstraintEstimator(8), GoalEstimator(8), action_spec=spec)
         >>> cem = CrossEntropyMethod(num_candidates=50, num_elites=5)
@@ -147,7 +143,7 @@ class LS3Planner(MPCPlannerBase):
         pessimism: float = 0.0,
         common_noise: bool = True,
         noise_scale: float = 1.0,
-        engine: Engine = "auto",
+        engine: EngineName = "auto",
         precision: Precision = "auto",
         action_key: NestedKey = "action",
         latent_key: NestedKey = "latent",
@@ -157,34 +153,28 @@ class LS3Planner(MPCPlannerBase):
     ) -> None:
         super().__init__(model, action_key=action_key)
         self.action_spec = model.full_action_spec[model.action_key]  # also where the model has it under another name
-        self.optimizer = _optimizer(optimizer, optimizer_settings)
+        self.optimizer = optimizer_or_default(optimizer, optimizer_settings, owner=type(self))
         self.horizon = require_at_least(horizon, 1, "horizon")
         self.num_particles = require_at_least(num_particles, 1, "num_particles")
         self.safe_set_threshold = require_probability(safe_set_threshold, "safe_set_threshold")
         self.constraint_threshold = require_probability(constraint_threshold, "constraint_threshold")
         self.relaxation = require_probability(relaxation, "relaxation")
         self.max_relaxations = require_at_least(max_relaxations, 0, "max_relaxations")
-        require_choice(constraint_reduction, ("max", "mean"), "constraint_reduction")
-        require_choice(safe_set_reduction, ("mean", "min"), "safe_set_reduction")
         require_choice(goal_reduction, ("count", "expected"), "goal_reduction")
         self.goal_reduction: GoalReduction = goal_reduction
         self.pessimism = _not_negative(pessimism, "pessimism")
         self.noise_scale = _not_negative(noise_scale, "noise_scale")
         self.common_noise = common_noise
         self.value, self.safe_set, self.encoder = value, safe_set, encoder
-
-        require_choice(engine, ("auto", "fused", "rollout"), "engine")
-        require_choice(precision, ("auto", "fp32", "bf16"), "precision")
-        self.engine: Engine = engine
-        self._reductions: dict[str, Any] = {
-            "constraint_reduction": constraint_reduction,
-            "safe_set_reduction": safe_set_reduction,
-        }
-        self._rollout = RolloutImagination(model, value, safe_set, **self._reductions)
-        self._fused: FusedImagination | None = None
-        self._precision: Precision = precision
-        if engine == "fused":
-            require_fusable(model, value, safe_set)
+        self.engine = Engine(
+            model,
+            value,
+            safe_set,
+            engine,
+            precision=precision,
+            constraint_reduction=constraint_reduction,
+            safe_set_reduction=safe_set_reduction,
+        )
 
         self.action_key = unravel_key(action_key)
         self.latent_key = _latent_key(encoder, latent_key)
@@ -210,18 +200,8 @@ class LS3Planner(MPCPlannerBase):
 
     @property
     def imagine(self) -> Imagination:
-        """The engine that imagines plans now: modules may have been exchanged, or hooked, since the last plan."""
-        if self.engine == "rollout":
-            return self._rollout
-        if self.engine == "fused":
-            require_fusable(self.env, self.value, self.safe_set)
-        elif not FusedImagination.supports(self.env, self.value, self.safe_set):
-            return self._rollout
-        if self._fused is None:
-            self._fused = FusedImagination(
-                self.env, self.value, self.safe_set, precision=self._precision, **self._reductions
-            )
-        return self._fused
+        """What imagines plans now: modules may have been exchanged, or hooked, since the last plan."""
+        return self.engine.choose()
 
     def sample_noise(self, batch: int) -> PlanNoise:
         """All noise that a plan for ``batch`` rows can need; large, meant for tests and comparisons."""
@@ -358,30 +338,6 @@ class LS3Planner(MPCPlannerBase):
         return self.imagine(
             latent.float(), actions.float(), sampled._replace(noise=sampled.noise[:, :, :, :candidates])
         )
-
-
-def _optimizer(optimizer: Optimizer | None, settings: dict[str, Any]) -> Optimizer:
-    """The given optimiser, or the cross-entropy method with ``settings``."""
-    known = list(inspect.signature(CrossEntropyMethod).parameters)
-    unknown = [name for name in settings if name not in known]
-    if unknown:
-        own = [name for name in inspect.signature(LS3Planner).parameters if name != "optimizer_settings"]
-        raise TypeError(
-            f"LS3Planner knows no setting {', '.join(unknown)}. Its own are {', '.join(own)}; those of its optimiser, "
-            f"CrossEntropyMethod, are {', '.join(known)}."
-        )
-    if optimizer is None:
-        return CrossEntropyMethod(**settings)
-    if settings:
-        raise TypeError(
-            f"{', '.join(settings)} are settings of the optimiser: give them to {type(optimizer).__name__}, which was "
-            "passed as optimizer."
-        )
-    if not isinstance(optimizer, Optimizer):
-        needed = ("num_candidates", "uses_warm_start", "max_iterations", "sample_noise", "__call__")
-        missing = [name for name in needed if not hasattr(optimizer, name)]
-        raise TypeError(f"optimizer must be an Optimizer; {type(optimizer).__name__} lacks {', '.join(missing)}.")
-    return optimizer
 
 
 def _latent_key(encoder: TensorDictModuleBase | None, latent_key: NestedKey) -> NestedKey:

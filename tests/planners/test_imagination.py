@@ -106,7 +106,7 @@ def test_reductions_and_noise_make_a_difference():
     assert not torch.allclose(imagine(latent, actions, noise).value, imagine(latent, actions, other).value, atol=1e-3)
 
 
-def test_under_common_noise_equal_plans_are_judged_equally():
+def test_under_common_noise_equal_plans_are_rated_equally():
     env, value, safe_set = modules()
     latent, actions, noise = problem(common=True)
     same = actions[:, :1].expand(-1, N, -1, -1)

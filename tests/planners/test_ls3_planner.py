@@ -444,7 +444,7 @@ def test_auto_takes_the_fast_engine_where_it_can_and_any_module_otherwise():
         LS3Planner(planner.env, OwnValue(), planner.safe_set, engine="fused", **SMALL)
 
 
-def test_statistics_judge_given_plans():
+def test_given_plans_are_imagined():
     planner = stub_planner(safe_set=classifier(SafeSet, slope=1.0))
     plans = torch.zeros(1, 2, 3, A)
     plans[0, 1, :, 0] = 1.0
