@@ -249,11 +249,12 @@ class TaggedReplayBuffer:
             filters: its fields, in its place.
         """
         selection = RowSelection.of(selection, filters)
-        if selection not in self._views:
-            self._views[selection] = TensorDictReplayBuffer(
+        view = self._views.get(selection)
+        if view is None:
+            view = self._views[selection] = TensorDictReplayBuffer(
                 storage=self.transitions.storage, sampler=TagSampler(selection), writer=ImmutableDatasetWriter()
             )
-        return self._views[selection]
+        return view
 
     def count(self, selection: RowSelection | None = None, **filters: Any) -> int:
         """How many transitions a selection admits; the arguments are those of :meth:`view`."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from tensordict import LazyStackedTensorDict, NestedKey, TensorDict, TensorDictBase, is_tensor_collection
+from tensordict import LazyStackedTensorDict, NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor
 from torch import Tensor
 
 from ls3_torchrl._checks import require_finite, require_keys
@@ -140,7 +140,7 @@ def save_episodes(
 
 
 def _keys(row: TensorDictBase) -> list[tuple[str, ...]]:
-    return [as_tuple(key) for key in row.keys(include_nested=True, leaves_only=True)]
+    return [as_tuple(key) for key in row.keys(True, True, is_leaf=is_leaf_nontensor)]
 
 
 def _require_tensors(rows: list[TensorDictBase], name: str) -> None:
@@ -152,7 +152,7 @@ def _require_tensors(rows: list[TensorDictBase], name: str) -> None:
                 f"{sorted(expected ^ set(_keys(row)))}. Leave them out with exclude()."
             )
     for key in expected:
-        if not isinstance(rows[0].get(key), Tensor) or is_tensor_collection(rows[0].get(key)):
+        if not isinstance(rows[0].get(key), Tensor):
             raise TypeError(f"{name}: {key} is not a tensor, and only tensors are saved. Leave it out with exclude().")
 
 
