@@ -97,7 +97,7 @@ class Comparison(Algorithm):
         options, penalty = self.options, self.options.get("penalty", 0.0)
 
         def draw() -> TensorDictBase:
-            rows = self.buffer.sample(options.batch_size, tags=tags, pixels=self.vae is None)
+            rows = self.buffer.sample(options.batch_size, tags=tags, observations=self.vae is None)
             if task_action:
                 rows.set("action", rows["task_action"])
             reached = rows.get("next")

@@ -27,9 +27,9 @@ def warmed_up(share: float, warmup: Sequence[float] | None) -> float:
 
 def enlarge(pixels: Tensor, buffer: TaggedReplayBuffer, goal: int | None) -> Tensor:
     """Images as if drawn from a dataset that shifts and perspectives have enlarged to ``goal`` images."""
-    if goal is None or goal <= len(buffer.pixels):
+    if goal is None or goal <= len(buffer.frames):
         return pixels
-    changed = torch.rand(len(pixels)) > len(buffer.pixels) / goal
+    changed = torch.rand(len(pixels)) > len(buffer.frames) / goal
     if changed.any():
         pixels = pixels.clone()
         pixels[changed] = random_perspective(pixels[changed])
@@ -38,7 +38,7 @@ def enlarge(pixels: Tensor, buffer: TaggedReplayBuffer, goal: int | None) -> Ten
 
 def warn_of_collapse(error: float, buffer: TaggedReplayBuffer) -> None:
     """Say so when the VAE draws little more than the mean of all images: nothing can be learnt from its latents."""
-    images = buffer.sample_pixels(512)["pixels"].float() / 255.0
+    images = buffer.sample_frames(512)["pixels"].float() / 255.0
     variance = float((images - images.mean(0)).square().mean())
     if error > 0.6 * variance:
         console.print(
@@ -49,7 +49,7 @@ def warn_of_collapse(error: float, buffer: TaggedReplayBuffer) -> None:
 
 def encode(agent: LS3Agent, buffer: TaggedReplayBuffer) -> None:
     """Encode every frame."""
-    with progress(len(buffer.pixels), "Encoding", "frame") as bar:
+    with progress(len(buffer.frames), "Encoding", "frame") as bar:
         buffer.encode(agent.encoder, progress=lambda done, _: bar.update(done - bar.n))
 
 
@@ -81,7 +81,7 @@ def train_vae(agent: LS3Agent, buffer: TaggedReplayBuffer, config: DictConfig, r
     for half in (agent.encoder, agent.decoder):
         half.to(memory_format=torch.channels_last)
     if agent.decoder.background is not None:
-        agent.decoder.set_background(buffer.mean_image())
+        agent.decoder.set_background(buffer.mean_frame())
     loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta, reduction=options.reduction)
     loss.set_keys(pixels="vae_input", target="vae_target")
     predictability = LatentPredictionLoss(agent.encoder, agent.dynamics)
@@ -98,9 +98,9 @@ def train_vae(agent: LS3Agent, buffer: TaggedReplayBuffer, config: DictConfig, r
 
     def draw(count: int) -> TensorDictBase:
         if not weight:
-            return buffer.sample_pixels(count)
+            return buffer.sample_frames(count)
         steps, left_out = options.prediction_horizon, None if config.loss.frozen_dynamics else "after_violation"
-        return buffer.sample_pixel_transitions(count, without=left_out, steps=steps if steps > 1 else None)
+        return buffer.sample_frame_transitions(count, without=left_out, steps=steps if steps > 1 else None)
 
     with threads(options.threads), progress(options.steps, "VAE") as bar:
         for i in range(options.steps):
@@ -133,7 +133,7 @@ def train_vae(agent: LS3Agent, buffer: TaggedReplayBuffer, config: DictConfig, r
     agent.decoder.requires_grad_(False)
     encode(agent, buffer)
     if options.unit_scale:
-        spread = float(buffer.latents.storage[:]["loc"].std(0).square().mean().sqrt())
+        spread = float(buffer.transitions.storage[:]["loc"].std(0).square().mean().sqrt())
         agent.encoder.rescale(1.0 / spread)
         agent.decoder.rescale(1.0 / spread)
         encode(agent, buffer)

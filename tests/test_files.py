@@ -1,9 +1,11 @@
 """A file is whole or not there."""
 
+import json
+
 import pytest
 import torch
 
-from ls3_torchrl.files import save_atomically
+from ls3_torchrl.files import save_atomically, save_json_atomically
 
 
 class Unpicklable:
@@ -19,3 +21,11 @@ def test_a_save_that_fails_leaves_the_old_file(tmp_path):
     save_atomically({"weights": torch.zeros(3)}, path)
     assert torch.equal(torch.load(path)["weights"], torch.zeros(3))
     assert [file.name for file in path.parent.iterdir()] == ["file.pt"]
+
+
+def test_json_is_whole_or_not_there_too(tmp_path):
+    path = save_json_atomically({"answer": 42}, tmp_path / "new" / "file.json")
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        save_json_atomically({"answer": object()}, path)
+    assert json.loads(path.read_text()) == {"answer": 42}
+    assert [file.name for file in path.parent.iterdir()] == ["file.json"]

@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import pytest
 import torch
 
@@ -102,3 +105,26 @@ def test_perspectives_that_lose_the_image_are_refused(options):
 def test_perspective_needs_uint8():
     with pytest.raises(TypeError, match=r"uint8 images, got torch\.float32"):
         random_perspective(torch.zeros(1, 3, 64, 64))
+
+
+def test_only_perspectives_need_opencv_and_say_how_to_get_it():
+    code = """
+import sys
+sys.modules["cv2"] = None  # what a missing libGL.so.1 comes to
+import torch
+from ls3_torchrl.data import TaggedReplayBuffer, random_perspective, random_resized_crop
+random_resized_crop(torch.zeros(1, 3, 64, 64))
+try:
+    random_perspective(torch.zeros(1, 3, 64, 64, dtype=torch.uint8))
+except ImportError as error:
+    print(error)
+"""
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "random_perspective needs OpenCV" in said
+    assert "pip install 'ls3-torchrl[recipes]' or pip install opencv-python-headless" in said
+
+
+def test_the_data_path_is_imported_without_opencv():
+    code = "import sys, ls3_torchrl.data; print('cv2' in sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["False"]

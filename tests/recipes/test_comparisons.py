@@ -248,8 +248,8 @@ def test_cloning_trains_the_actors_mean_and_leaves_its_spread(configure):
     algorithm = parts(configure("sacfd", "policy.cloning_steps=150", "policy.hidden=[32]", "policy.lr=0.01"))
     buffer = fill(algorithm, "success")
     wanted = torch.tensor([1.5, -2.0])
-    buffer.latents.storage[:].get("action").copy_(wanted.expand(9, 2))
-    seen = buffer.latents.storage[:].select("loc")
+    buffer.transitions.storage[:].get("action").copy_(wanted.expand(9, 2))
+    seen = buffer.transitions.storage[:].select("loc")
     before = algorithm.networks["actor"](seen.clone())["action_scale"].detach()
     algorithm.phases()["cloning"]()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -313,7 +313,7 @@ def walk_online(algorithm, teacher, rounds):
     """Train on walks: offline on the teacher's, online on its own. Mean steps to the goal, of each round."""
     data = {Tag.SUCCESS: Walk(20, teacher).rows.flatten()}
 
-    def sample(batch_size, *, tags, pixels=False):
+    def sample(batch_size, *, tags, observations=False):
         wanted = [data[tag] for tag in tags if tag in data]
         rows = torch.cat(wanted)
         return rows[torch.randint(len(rows), (batch_size,))].clone()

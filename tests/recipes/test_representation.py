@@ -30,9 +30,9 @@ def test_batches_seem_drawn_from_the_enlarged_dataset(config):
     buffer.add(noisy_episode(), "success")
     pixels = torch.randint(256, (400, 3, 64, 64), dtype=torch.uint8)
     assert torch.equal(enlarge(pixels, buffer, None), pixels)
-    same = (enlarge(pixels, buffer, 4 * len(buffer.pixels)) == pixels).flatten(1).all(1).float().mean()
+    same = (enlarge(pixels, buffer, 4 * len(buffer.frames)) == pixels).flatten(1).all(1).float().mean()
     assert abs(same - 0.25) < 0.08
-    assert torch.equal(enlarge(pixels, buffer, len(buffer.pixels)), pixels)
+    assert torch.equal(enlarge(pixels, buffer, len(buffer.frames)), pixels)
 
 
 def test_unit_scale_measures_latents_in_their_spread_and_keeps_the_pictures(config):
@@ -46,7 +46,7 @@ def test_unit_scale_measures_latents_in_their_spread_and_keeps_the_pictures(conf
         buffer = TaggedReplayBuffer(20, latent_dim=config.agent.latent_dim)
         buffer.add(episode, "success")
         train_vae(agent, buffer, config, Silent())
-        spreads.append(buffer.latents.storage[:]["loc"].std(0).square().mean().sqrt().item())
+        spreads.append(buffer.transitions.storage[:]["loc"].std(0).square().mean().sqrt().item())
         pictures.append(agent.decoder(agent.encoder(episode.select("pixels")))["reco_pixels"])
     assert spreads[1] == pytest.approx(1.0, rel=1e-3)
     assert spreads[0] != pytest.approx(1.0, rel=1e-2)
@@ -119,7 +119,7 @@ def test_a_vae_can_be_taken_from_a_trained_agent_of_the_same_shape(config, tmp_p
     assert not any(p.requires_grad for p in agent.encoder.parameters())
     assert all(torch.equal(a, b) for a, b in zip(dynamics, agent.dynamics.parameters(), strict=True))
     seen = trained.encoder(episode.select("pixels"))
-    torch.testing.assert_close(buffer.latents.storage[:]["loc"], seen["loc"], atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(buffer.transitions.storage[:]["loc"], seen["loc"], atol=1e-4, rtol=1e-4)
     OmegaConf.update(config, "agent.latent_dim", 5)
     with pytest.raises(ValueError, match="latent_dim 8 instead of 5"):
         train_vae(make_agent(config), buffer, config, run)

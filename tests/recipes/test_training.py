@@ -53,8 +53,8 @@ def test_what_follows_a_violation_teaches_the_dynamics_as_the_setting_says(confi
     number = torch.arange(9.0).unsqueeze(-1).expand(-1, 2)
     buffer.add(TensorDict({"pixels": step["pixels"], "action": number, "next": step}, [9]), "constraint")
     drawn = []
-    draw = buffer.sample_pixel_transitions
-    buffer.sample_pixel_transitions = lambda *a, **o: drawn.append(draw(*a, **o)) or drawn[-1]
+    draw = buffer.sample_frame_transitions
+    buffer.sample_frame_transitions = lambda *a, **o: drawn.append(draw(*a, **o)) or drawn[-1]
     training = Training(agent, buffer, config, Silent())
     train_vae(agent, buffer, config, Silent())
     latent = {int(step) for step in training.dynamics.sample()["action"].flatten().tolist()}
