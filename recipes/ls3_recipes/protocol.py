@@ -2,113 +2,51 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
-from torchrl.envs import TransformedEnv
 
-import pictures
-from common import (
-    RunFolder,
-    choose_device,
-    console,
-    episode_figures,
-    hardware,
-    print_summary,
-    progress,
-    summarise,
-    tick,
-    timed,
-)
-from ls3_torchrl.data import Tag, TaggedReplayBuffer, load_episodes, save_episodes
-from rollout import collect_demonstrations, make_env, run_episodes, whole_episodes
+from ls3_recipes.algorithms import ALGORITHMS
+from ls3_recipes.console import console, print_summary
+from ls3_recipes.device import choose_device, hardware
+from ls3_recipes.figures import Figures, best_update, episode_figures, means_of, summarise
+from ls3_recipes.options import as_dict
+from ls3_recipes.plots.run import plot_run
+from ls3_recipes.rollout import collect_demonstrations, make_env, run_episodes, tick, whole_episodes
+from ls3_recipes.run_folder import RunFolder
+from ls3_recipes.run_settings import RunSettings
+from ls3_torchrl.data import Tag, load_episodes, save_episodes
+from ls3_torchrl.trainers.learner import log_scalars
+from ls3_torchrl.trainers.progress import progress_bar
+
+Offline = dict[Tag, TensorDictBase]
 
 
-class Algorithm(ABC):
-    """What the protocol asks of an algorithm.
-
-    Everything that can be wrong with the settings is found in the constructor, before time is spent.
+def run_experiment(settings: RunSettings) -> dict:
+    """Follow the protocol from demonstrations to pictures.
 
     Args:
-        config: the recipe's configuration.
-        env: the environment that it will act in.
-        device: of its networks.
+        settings: of the run; an instance of its algorithm's ``settings_class``.
+
+    Returns:
+        What is written to ``summary.json``.
+
+    Raises:
+        ValueError, FileNotFoundError, FileExistsError: for settings, data or folders that cannot be used; before any
+            work is done.
     """
-
-    #: As in the configuration's ``algorithm``.
-    name: str
-    #: Tags of the offline data that it cannot do without.
-    needs: tuple[Tag, ...] = (Tag.SUCCESS,)
-    config: DictConfig
-    #: What acts; writes ``action``.
-    policy: TensorDictModuleBase
-
-    @abstractmethod
-    def __init__(self, config: DictConfig, env: TransformedEnv, device: torch.device) -> None: ...
-
-    def prepare(self, env: TransformedEnv) -> None:  # noqa: B027
-        """Append what the policy needs of an environment."""
-
-    def offline_data(self, offline: dict[Tag, TensorDictBase]) -> dict[Tag, TensorDictBase]:
-        """The offline episodes as the buffer takes them."""
-        return offline
-
-    def make_buffer(self, device: torch.device, **labels: Any) -> TaggedReplayBuffer:
-        """An empty buffer; ``labels`` are options of its own about what is kept of an episode."""
-        config = self.config
-        return TaggedReplayBuffer(
-            config.task.buffer_capacity,
-            latent_dim=config.agent.latent_dim,
-            gamma=config.loss.gamma,
-            success_tail=config.loss.success_tail,
-            scratch_dir=config.scratch_dir,
-            device=device,
-            **labels,
-        )
-
-    @abstractmethod
-    def begin(self, buffer: TaggedReplayBuffer, run: RunFolder, horizon: int) -> None:
-        """Make the learners, on a buffer that holds the offline data."""
-
-    @abstractmethod
-    def phases(self) -> dict[str, Callable[[], None]]:
-        """What is trained offline: the phases' names, and what carries them out, in their order."""
-
-    @abstractmethod
-    def train_online(self) -> None:
-        """Learn from all data, after new episodes."""
-
-    def describe(self, episodes: TensorDictBase) -> dict[str, float]:
-        """Figures of the policy's own about episodes that it acted in, for the metrics."""
-        return {}
-
-    def diagnose(self, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> dict[str, float]:
-        """Figures about what it has learnt, for the summary."""
-        return {}
-
-    @abstractmethod
-    def save(self, path: Path) -> Path:
-        """Write all networks to one file."""
-
-    @abstractmethod
-    def restore(self, path: Path) -> None:
-        """Take the networks of a file."""
-
-    def draw(  # noqa: B027
-        self,
-        folder: Path,
-        offline: dict[Tag, TensorDictBase],
-        tracks: list[torch.Tensor],
-        evaluation: TensorDictBase,
-    ) -> None:
-        """Pictures of its own, beside those that every run leaves."""
+    experiment = Experiment(settings)
+    experiment.start()
+    experiment.collect()
+    experiment.train_offline()
+    experiment.improve_online()
+    experiment.select()
+    experiment.evaluate()
+    return experiment.finish()
 
 
 def seeds(seed: int) -> dict[str, int]:
@@ -117,129 +55,161 @@ def seeds(seed: int) -> dict[str, int]:
     return {name: 10_000 * seed + 1_000 * i for i, name in enumerate(names)}
 
 
-def best_update(online: list[dict[str, torch.Tensor]]) -> int:
-    """Number of the update whose episodes violated least and, among those, returned most; the later of equals."""
-    ranks = [
-        (-float(figures["violation"].float().mean()), float(figures["return"].float().mean()), update)
-        for update, figures in enumerate(online)
-    ]
-    return max(ranks)[-1]
+class Experiment:
+    """One run: its parts in the order of :func:`run_experiment`, each leaving what the next ones need.
 
-
-def follow(config: DictConfig, algorithm_class: type[Algorithm]) -> dict:
-    """Follow the protocol from demonstrations to pictures.
+    The constructor finds all that can be wrong with the settings, and does no work.
 
     Args:
-        config: the resolved configuration of the recipe.
-        algorithm_class: what learns and acts.
-
-    Returns:
-        What is written to ``summary.json``.
+        settings: of the run.
     """
-    device = choose_device(config.device)
-    if config.threads:
-        torch.set_num_threads(config.threads)
-    seed = seeds(config.seed)
-    torch.manual_seed(seed["learning"])
 
-    env = make_env(config, config.online.episodes_per_update, seed["online"], device)
-    algorithm = algorithm_class(config, env, device)
-    algorithm.prepare(env)
-    offline = load_episodes(config.data, task=config.task.name) if config.data else None
-    for tag in algorithm.needs:
-        if offline is not None and tag not in offline:
-            raise ValueError(
-                f"{config.data} has no {tag.name.lower()} episodes, which {algorithm.name} needs. Collect them first."
-            )
-    run = RunFolder(config.output, config)
-    seconds: dict[str, float] = {}
+    def __init__(self, settings: RunSettings) -> None:
+        self.settings, self.seed = settings, seeds(settings.seed)
+        self.device = choose_device(settings.device)
+        if settings.threads:
+            torch.set_num_threads(settings.threads)
+        torch.manual_seed(self.seed["learning"])
+        self.env = make_env(settings.task, settings.online.episodes_per_update, self.seed["online"], self.device)
+        self.horizon: int = self.env.base_env.horizon
+        self.algorithm = ALGORITHMS[settings.algorithm](settings, self.env, self.device)
+        self.algorithm.prepare(self.env)
+        self.buffer = self.algorithm.make_buffer(self.device)
+        self.offline: Offline = self._given_data() if settings.data else {}
+        self.online: list[Figures] = []
+        self.tracks: list[torch.Tensor] = []
+        self.seconds: dict[str, float] = {}
 
-    with timed(seconds, "demonstrations"):
-        if offline is None:
-            with torch.random.fork_rng():  # what is learnt does not depend on whether the data were there already
-                offline = collect_demonstrations(config, seed["demonstrations"])
-            folder = save_episodes(offline, run.path / "demonstrations", task=config.task.name, seed=config.seed)
-            offline = load_episodes(folder)  # from the disk from now on: there may be more pictures than memory
-        buffer = algorithm.make_buffer(device)
-        for tag, episodes in algorithm.offline_data(offline).items():
-            buffer.add(episodes, tag)
-    demonstrations = [episode_figures(offline[Tag.SUCCESS])]
-    horizon, worlds = env.base_env.horizon, config.online.episodes_per_update
-    algorithm.begin(buffer, run, horizon)
-    for phase, train in algorithm.phases().items():
-        with timed(seconds, phase):
-            train()
-    algorithm.save(run.path / "checkpoints" / "agent_000.pt")
+    def _given_data(self) -> Offline:
+        """The offline data that the settings name."""
+        assert self.settings.data is not None
+        offline = load_episodes(self.settings.data, task=self.settings.task.name)
+        for tag in self.algorithm.needs:
+            if tag not in offline:
+                raise ValueError(
+                    f"{self.settings.data} has no {tag.name.lower()} episodes, which {self.algorithm.name} needs. "
+                    "Collect them first."
+                )
+        return offline
 
-    online, tracks = [], []
-    updates = config.online.updates
-    bar = progress(horizon * max(updates, 1), "Planning", "step")
-    ticking = algorithm.policy.register_forward_hook(lambda *_: tick(bar))
-    if updates > 0:
+    @contextmanager
+    def _timed(self, phase: str) -> Iterator[None]:
+        """Add the block's wall-clock seconds to those of a phase."""
+        start = time.perf_counter()
+        yield
+        self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - start
+
+    def start(self) -> None:
+        """Make the run's folder."""
+        self.folder = RunFolder(self.settings.output, as_dict(self.settings))
+
+    def collect(self) -> None:
+        """Collect the demonstrations, unless they were given, and fill the buffer."""
+        task, seed = self.settings.task, self.settings.seed
+        with self._timed("demonstrations"):
+            if not self.offline:
+                with torch.random.fork_rng():  # what is learnt does not depend on whether the data were there already
+                    collected = collect_demonstrations(task, self.seed["demonstrations"])
+                path = save_episodes(collected, self.folder.path / "demonstrations", task=task.name, seed=seed)
+                self.offline = load_episodes(path)  # from the disk from now on: there may be more than memory
+            for tag, episodes in self.algorithm.offline_data(self.offline).items():
+                self.buffer.add(episodes, tag)
+
+    def train_offline(self) -> None:
+        """Carry out the algorithm's offline phases."""
+        self.algorithm.begin(self.buffer, self.folder.logger, self.horizon)
+        for phase, train in self.algorithm.phases().items():
+            with self._timed(phase):
+                train()
+        self.algorithm.save(self.folder.checkpoint(0))
+
+    def improve_online(self) -> None:
+        """Collect episodes with the policy and learn from them, round by round."""
+        updates, frames = self.settings.online.updates, self.settings.online.episodes_per_update * self.horizon
+        if updates == 0:
+            return
+        bar = progress_bar(self.horizon, "Planning")
+        ticking = self.algorithm.policy.register_forward_hook(lambda *_: tick(bar))
         collector = Collector(
-            env,
-            algorithm.policy,
-            frames_per_batch=worlds * horizon,
-            total_frames=updates * worlds * horizon,
-            device=device,
+            self.env,
+            self.algorithm.policy,
+            frames_per_batch=frames,
+            total_frames=updates * frames,
+            device=self.device,
         )
         rounds = iter(collector)
-    for update in range(updates):
-        bar.reset(total=horizon)
-        bar.set_description_str(f"{f'Episodes, update {update + 1}/{updates}':<24}")
-        with timed(seconds, "planning"):
-            episodes = whole_episodes(next(rounds))
-        figures = episode_figures(episodes)
-        online.append(figures)
-        tracks.append(episodes["next", "state"].cpu())
-        scores = {f"mean_{name}": float(value.float().mean()) for name, value in figures.items()}
-        run.log("online", (update + 1) * worlds, **scores, **algorithm.describe(episodes))
-        console.print(
-            f"  update {update + 1}: return {scores['mean_return']:.1f}, success {scores['mean_success']:.0%}, "
-            f"violation {scores['mean_violation']:.0%}"
-        )
-        buffer.add(episodes, Tag.ONLINE)
-        with timed(seconds, "updates"):
-            algorithm.train_online()
-        algorithm.save(run.path / "checkpoints" / f"agent_{update + 1:03d}.pt")
-    ticking.remove()
-    bar.close()
-    if updates > 0:
+        for update in range(1, updates + 1):
+            bar.reset(total=self.horizon)
+            bar.set_description_str(f"{f'Episodes, update {update}/{updates}':<24}")
+            with self._timed("planning"):
+                episodes = whole_episodes(next(rounds))
+            self._record(update, episodes)
+            self.buffer.add(episodes, Tag.ONLINE)
+            with self._timed("updates"):
+                self.algorithm.update()
+            self.algorithm.save(self.folder.checkpoint(update))
+        ticking.remove()
+        bar.close()
         collector.shutdown()
-    if config.online.select == "best" and online:
-        # An agent that acted, and is known by its episodes; the last one never did.
-        best = best_update(online)
-        algorithm.restore(run.path / "checkpoints" / f"agent_{best:03d}.pt")
-        console.print(f"agent.pt is the agent of update {best + 1}, whose episodes went best")
-    path = algorithm.save(run.path / "agent.pt")
 
-    with timed(seconds, "evaluation"):
-        world = make_env(config, config.evaluation.episodes, seed["evaluation"], device)
-        algorithm.prepare(world)
-        evaluation = run_episodes(world, algorithm.policy, what="Evaluation")
-    with timed(seconds, "probe"):
-        probed = algorithm.diagnose(offline, evaluation)
-    summary = {
-        "algorithm": algorithm.name,
-        "task": config.task.name,
-        "preset": config.preset,
-        "seed": config.seed,
-        "minutes": 0.0,
-        "demonstrations": summarise(demonstrations),
-        "probe": probed,
-        **({"online": summarise(online)} if online else {}),
-        "evaluation": summarise([episode_figures(evaluation)]),
-        "hardware": hardware(device),
-        "agent": path.name,
-    }
-    if config.pictures:
-        with timed(seconds, "pictures"):
-            torch.save(tracks, run.path / "online_tracks.pt")
-            pictures.draw_run(run.path, config, offline, tracks, evaluation)
-            algorithm.draw(run.path, offline, tracks, evaluation)
-    summary["minutes"] = round(run.seconds / 60, 2)
-    summary["seconds"] = {name: round(value, 1) for name, value in seconds.items()}
-    run.write_json("summary.json", summary)
-    run.close()
-    print_summary(summary, run.path)
-    return summary
+    def _record(self, update: int, episodes: TensorDictBase) -> None:
+        """Keep and tell how the episodes of a round went."""
+        figures = episode_figures(episodes)
+        self.online.append(figures)
+        self.tracks.append(episodes["next", "state"].cpu())
+        means = means_of(figures)
+        step = update * self.settings.online.episodes_per_update
+        log_scalars(self.folder.logger, "online", step, means | self.algorithm.describe(episodes))
+        console.print(
+            f"  update {update}: return {means['mean_return']:.1f}, success {means['mean_success']:.0%}, "
+            f"violation {means['mean_violation']:.0%}"
+        )
+
+    def select(self) -> None:
+        """Keep the agent: the last one, or the one whose episodes went best."""
+        if self.settings.online.select == "best" and self.online:
+            # An agent that acted, and is known by its episodes; the last one never did.
+            best = best_update(self.online)
+            self.algorithm.restore(self.folder.checkpoint(best))
+            console.print(f"agent.pt is the agent of update {best + 1}, whose episodes went best")
+        self.agent_file = self.algorithm.save(self.folder.path / "agent.pt").name
+
+    def evaluate(self) -> None:
+        """Let the agent act without exploring, and ask what it has learnt."""
+        settings = self.settings
+        with self._timed("evaluation"):
+            env = make_env(settings.task, settings.evaluation.episodes, self.seed["evaluation"], self.device)
+            self.algorithm.prepare(env)
+            self.evaluation = run_episodes(env, self.algorithm.policy, what="Evaluation")
+        with self._timed("probe"):
+            self.probe = self.algorithm.diagnose(self.offline, self.evaluation)
+
+    def finish(self) -> dict:
+        """Leave pictures and summary."""
+        summary = self._summary()
+        if self.settings.pictures:
+            with self._timed("pictures"):
+                torch.save(self.tracks, self.folder.path / "online_tracks.pt")
+                plot_run(self.folder.path, self.settings.task, self.offline, self.tracks, self.evaluation)
+                self.algorithm.plot(self.folder.path, self.offline, self.evaluation)
+        summary["minutes"] = self.folder.minutes
+        summary["seconds"] = {name: round(value, 1) for name, value in self.seconds.items()}
+        self.folder.write_json("summary.json", summary)
+        self.folder.close()
+        print_summary(summary, self.folder.path)
+        return summary
+
+    def _summary(self) -> dict:
+        return {
+            "algorithm": self.algorithm.name,
+            "task": self.settings.task.name,
+            "preset": self.settings.preset,
+            "seed": self.settings.seed,
+            "minutes": 0.0,
+            "demonstrations": summarise([episode_figures(self.offline[Tag.SUCCESS])]),
+            "probe": self.probe,
+            **({"online": summarise(self.online)} if self.online else {}),
+            "evaluation": summarise([episode_figures(self.evaluation)]),
+            "hardware": hardware(self.device),
+            "agent": self.agent_file,
+        }

@@ -3,31 +3,36 @@
 from __future__ import annotations
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
+from tqdm import tqdm
 
 import ls3_envs
-from common import console, progress, tick
+from ls3_recipes.console import console
+from ls3_recipes.run_settings import TaskSettings
 from ls3_torchrl.data import Tag
+from ls3_torchrl.trainers.progress import progress_bar
 
 
-def make_env(config: DictConfig, worlds: int, seed: int, device: torch.device) -> TransformedEnv:
-    """The task's environment with ``worlds`` worlds and marks at the starts of episodes."""
-    options = {"horizon": config.task.horizon} if "horizon" in config.task else {}
-    return ls3_envs.make(config.task.name, num_envs=worlds, seed=seed, device=device, **options)
+def tick(bar: tqdm) -> None:
+    """Advance a bar from a forward hook, whose return value would replace the module's output."""
+    bar.update()
 
 
-def collect_demonstrations(config: DictConfig, seed: int) -> dict[Tag, TensorDictBase]:
+def make_env(task: TaskSettings, num_envs: int, seed: int, device: torch.device) -> TransformedEnv:
+    """The task's environment, ``num_envs`` of them side by side, with marks at the starts of episodes."""
+    options = {} if task.horizon is None else {"horizon": task.horizon}
+    return ls3_envs.make(task.name, num_envs=num_envs, seed=seed, device=device, **options)
+
+
+def collect_demonstrations(task: TaskSettings, seed: int) -> dict[Tag, TensorDictBase]:
     """The task's offline data by tag; as many episodes as the paper, or ``task.offline_episodes`` of each."""
-    kinds = ls3_envs.domain(config.task.name).offline
+    kinds = ls3_envs.domain(task.name).offline
     datasets = {}
-    with progress(len(kinds), "Demonstrations", "kind") as bar:
+    with progress_bar(len(kinds), "Demonstrations", unit="kind") as bar:
         for i, kind in enumerate(kinds):
-            episodes = ls3_envs.collect_offline(
-                config.task.name, kind, episodes=config.task.get("offline_episodes"), seed=seed + i
-            )
+            episodes = ls3_envs.collect_offline(task.name, kind, episodes=task.offline_episodes, seed=seed + i)
             datasets[Tag.parse(kind)] = whole_episodes(episodes)
             bar.update()
     return datasets
@@ -46,9 +51,9 @@ def whole_episodes(episodes: TensorDictBase) -> TensorDictBase:
 
 
 def run_episodes(env: TransformedEnv, policy: TensorDictModuleBase, *, what: str) -> TensorDictBase:
-    """Whole episodes ``[N, T]`` of a policy, at its best rather than exploring, side by side in the env's worlds."""
+    """Whole episodes ``[N, T]`` of a policy, at its best rather than exploring, side by side."""
     horizon = env.base_env.horizon
-    with progress(horizon, what) as bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+    with progress_bar(horizon, what) as bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         ticking = policy.register_forward_hook(lambda *_: tick(bar))
         out = env.rollout(horizon, policy, break_when_any_done=False)
         ticking.remove()

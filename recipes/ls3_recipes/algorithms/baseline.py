@@ -1,75 +1,149 @@
-"""What the comparisons share: networks, frozen latents or convolutions, batches, cloning, files and pictures."""
+"""What the baselines share: networks, frozen latents or convolutions, batches, cloning, files and pictures."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
-from torchrl.objectives import BCLoss
+from torchrl.objectives import BCLoss, LossModule
+from torchrl.record.loggers import Logger
 
-import agent_pictures
-import pictures
-from common import RunFolder
-from learning import Learner
+from ls3_recipes.algorithms.base import Algorithm, make_agent
+from ls3_recipes.plots.agent import reconstructions
+from ls3_recipes.plots.plane import Field, maps, over_plane, plane_of
+from ls3_recipes.run_settings import RunSettings, at_least, one_of, positive
 from ls3_torchrl import LS3Agent
-from ls3_torchrl.baselines import PixelFeatures, action_bounds, gaussian_actor
+from ls3_torchrl.baselines import PixelFeatures, action_bounds
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.files import save_atomically
-from protocol import Algorithm
-from representation import train_vae
-from settings import agent_options, check_comparison
+from ls3_torchrl.trainers import Learner, VAETrainer
 
 FORMAT = "ls3_torchrl.comparison"
 VERSION = 1
 DEMONSTRATIONS = (Tag.SUCCESS,)
 
 
-class Comparison(Algorithm):
+@dataclass(frozen=True, kw_only=True)
+class PolicySettings:
+    """The actor of a baseline.
+
+    Args:
+        hidden: hidden layers of every network.
+        lr: Adam's learning rate, above 0.
+        batch_size: transitions in a step.
+        cloning_steps: gradient steps of the actor's mean on the successful demonstrations.
+    """
+
+    hidden: tuple[int, ...] = (256, 256)
+    lr: float = 3.0e-4
+    batch_size: int = 256
+    cloning_steps: int = 5000
+
+    def __post_init__(self) -> None:
+        """Refuse what would only fail after time was spent."""
+        for size in self.hidden:
+            at_least(size, 1, "hidden")
+        positive(self.lr, "lr")
+        at_least(self.batch_size, 1, "batch_size")
+        at_least(self.cloning_steps, 0, "cloning_steps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActorCriticSettings(PolicySettings):
+    """An actor whose critics learn from penalised rewards.
+
+    Args:
+        penalty: λ, added to the reward of a violation; at most 0.
+        initial_std: of an untrained actor, before squashing.
+        tau: of the lagged critics; a value that is wrong for ever sinks by 1 in 1 / tau steps.
+        zero_at_goal: the goal ends the task, whatever happens after.
+        critic_steps: gradient steps offline.
+        updates_per_step: gradient steps online, for each step of the environment.
+    """
+
+    penalty: float
+    initial_std: float = 0.3
+    tau: float = 0.05
+    zero_at_goal: bool = False
+    critic_steps: int = 5000
+    updates_per_step: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Refuse what would only fail after time was spent."""
+        super().__post_init__()
+        if self.penalty > 0.0:
+            raise ValueError(f"penalty is added to the reward of a violation: 0 or below, got {self.penalty}.")
+        positive(self.initial_std, "initial_std")
+        positive(self.tau, "tau")
+        at_least(self.critic_steps, 0, "critic_steps")
+        at_least(self.updates_per_step, 0, "updates_per_step")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaselineSettings(RunSettings):
+    """What a run of a baseline has, beside what every run has.
+
+    Args:
+        encoder: ``"latents"``, the means of the VAE that LS³ trains, frozen; or ``"conv"``, convolutions of each
+            network's own.
+        policy: of the actor and, where it has them, its critics.
+    """
+
+    encoder: Literal["latents", "conv"] = "latents"
+    policy: PolicySettings
+
+    def __post_init__(self) -> None:
+        """Refuse unknown encoders."""
+        one_of(self.encoder, ("latents", "conv"), "encoder")
+
+
+class Baseline(Algorithm):
     """Actor, and what it reads: the frozen latents of LS³'s VAE, or images through convolutions of its own."""
 
-    def __init__(self, config: DictConfig, env: TransformedEnv, device: torch.device) -> None:
-        check_comparison(config)
-        self.config, self.options = config, config.policy
-        channels = env.observation_spec["pixels"].shape[-3]
+    settings: BaselineSettings
+
+    def __init__(self, settings: BaselineSettings, env: TransformedEnv, device: torch.device) -> None:
+        self.settings = settings
         self.vae: LS3Agent | None = None
-        if config.encoder == "latents":
+        if settings.encoder == "latents":
             # The networks that LS³ would make: with the same seed, encoder and latents are LS³'s, bit by bit.
-            self.vae = LS3Agent(
-                action_dim=env.action_spec.shape[-1], in_channels=channels, **agent_options(config, env.action_spec)
-            ).to(device)
+            self.vae = make_agent(settings, env, device)
         self.observation = "pixels" if self.vae is None else "loc"
-
-        def build(make: Callable[..., Any], **more: Any) -> Any:
-            features = PixelFeatures(channels) if self.vae is None else None
-            size = PixelFeatures.size if self.vae is None else config.agent.latent_dim
-            return make(
-                env.action_spec,
-                size,
-                observation_key=self.observation,
-                features=features,
-                hidden=tuple(self.options.hidden),
-                **more,
-            ).to(device)
-
         low, high = action_bounds(env.action_spec)
         self.half = (high - low).to(device) / 2
         with torch.random.fork_rng():  # leaves the VAE's training the random stream that LS³'s has
-            self.networks = nn.ModuleDict(self.build(build))
+            self.networks = nn.ModuleDict(self.build(self._builder(env, device)))
         if self.vae is not None:
             self.networks.update({"encoder": self.vae.encoder, "decoder": self.vae.decoder})
         self.policy = self._seeing(self.act())
 
+    def _builder(self, env: TransformedEnv, device: torch.device) -> Callable[..., Any]:
+        """What calls a network's constructor with what all of them share."""
+        channels = env.observation_spec["pixels"].shape[-3]
+
+        def build(make: Callable[..., Any], **more: Any) -> Any:
+            return make(
+                env.action_spec,
+                PixelFeatures.size if self.vae is None else self.vae.architecture.latent_dim,
+                observation_key=self.observation,
+                features=PixelFeatures(channels) if self.vae is None else None,
+                hidden=tuple(self.settings.policy.hidden),
+                **more,
+            ).to(device)
+
+        return build
+
     def build(self, build: Callable[..., Any]) -> dict[str, nn.Module]:
         """The networks by name; one is the ``actor``."""
-        return {"actor": build(gaussian_actor, initial_std=self.options.initial_std)}
+        raise NotImplementedError
 
     def act(self) -> TensorDictModuleBase:
         """What acts on observations."""
@@ -78,51 +152,39 @@ class Comparison(Algorithm):
     def _seeing(self, policy: TensorDictModuleBase) -> TensorDictModuleBase:
         return policy if self.vae is None else TensorDictSequential(self.vae.encoder, policy)
 
-    def begin(self, buffer: TaggedReplayBuffer, run: RunFolder, horizon: int) -> None:
-        """Make the learners."""
-        self.buffer, self.run = buffer, run
-        self.bonus = 0.0
-        self.steps_per_update = round(self.options.updates_per_step * horizon * self.config.online.episodes_per_update)
+    def begin(self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int) -> None:
+        """Make the learner that clones."""
+        self.buffer, self.logger = buffer, logger
         with warnings.catch_warnings():  # TorchRL's own class lacks an annotation that TorchRL looks for
             warnings.filterwarnings("ignore", "The name target_actor_network_params wasn't part of the annotations")
             cloning = BCLoss(self.networks["actor"], loss_function=self._distance)
-        self.cloning = Learner("bc", cloning, self.rows(DEMONSTRATIONS), lr=self.options.lr)
+        self.cloning = self.learner("bc", cloning, lambda: self.sample(DEMONSTRATIONS))
+
+    def learner(self, names: str | list[str], loss: LossModule, sample: Callable[[], TensorDictBase], **how: Any) -> Learner:
+        """A learner with the policy's learning rate."""
+        return Learner(names, loss, sample, lr=self.settings.policy.lr, logger=self.logger, **how)
 
     def _distance(self, predicted: Tensor, expert: Tensor) -> Tensor:
         """Squared distances of actions, in units of half their range."""
         return ((predicted - expert) / self.half).square()
 
-    def rows(self, tags: Iterable[Tag], *, task_action: bool = False) -> Callable[[], TensorDictBase]:
-        """What draws batches: transitions with penalised rewards, and the ends that a critic should know of."""
-        options, penalty = self.options, self.options.get("penalty", 0.0)
-
-        def draw() -> TensorDictBase:
-            rows = self.buffer.sample(options.batch_size, tags=tags, pixels=self.vae is None)
-            if task_action:
-                rows.set("action", rows["task_action"])
-            reached = rows.get("next")
-            violated = reached["constraint"]
-            reached.set("reward", reached["reward"] + penalty * violated - self.bonus)
-            over = reached["success"] if options.zero_at_goal else torch.zeros_like(violated)
-            reached.set("terminated", over)
-            reached.set("done", over)
-            return rows
-
-        return draw
+    def sample(self, tags: Iterable[Tag]) -> TensorDictBase:
+        """A batch of transitions, with images where the networks read them."""
+        return self.buffer.sample(self.settings.policy.batch_size, tags=tags, observations=self.vae is None)
 
     def phases(self) -> dict[str, Callable[[], None]]:
         """The VAE where one is read, and cloning."""
-        phases: dict[str, Callable[[], None]] = {}
-        if self.vae is not None:
-            agent = self.vae
-            phases["vae"] = lambda: train_vae(agent, self.buffer, self.config, self.run)
-        return phases | {"cloning": self._clone}
+        return ({} if self.vae is None else {"vae": self._train_vae}) | {"cloning": self._clone}
+
+    def _train_vae(self) -> None:
+        assert self.vae is not None
+        VAETrainer(self.vae, self.buffer, self.settings.vae, logger=self.logger).train()
 
     def _clone(self) -> None:
         with set_exploration_type(ExplorationType.DETERMINISTIC):  # the actor's mean
-            self.cloning.train(self.options.cloning_steps, "Cloning", self.run)
+            self.cloning.train(self.settings.policy.cloning_steps, "Cloning")
 
-    def train_online(self) -> None:
+    def update(self) -> None:
         """Nothing is learnt."""
 
     def save(self, path: Path) -> Path:
@@ -142,31 +204,24 @@ class Comparison(Algorithm):
             raise ValueError(f"{path} holds no networks of {self.name}. Pass a file that this algorithm's run wrote.")
         self.networks.load_state_dict(content["state_dict"])
 
-    def fields(self, rows: TensorDictBase) -> dict[str, pictures.Field]:
+    def fields(self, rows: TensorDictBase) -> dict[str, Field]:
         """What can be drawn over the plane, of rows ``[n]`` with observation and the actor's action."""
         return {}
 
     @torch.no_grad()
-    def draw(
-        self,
-        folder: Path,
-        offline: dict[Tag, TensorDictBase],
-        tracks: list[Tensor],
-        evaluation: TensorDictBase,
-    ) -> None:
+    def plot(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> None:
         """Reconstructions of the VAE; value and risk over the plane where the states are one."""
         if self.vae is not None:
-            agent_pictures.reconstructions(folder, self.vae, offline)
-        env = pictures.plane_of(self.config)
+            reconstructions(folder, self.vae, offline)
+        env = plane_of(self.settings.task)
         if env is None:
             return
-        device = self.half.device
 
-        def judge(pixels: Tensor) -> TensorDictBase:
-            rows = TensorDict({"pixels": pixels.to(device)}, [len(pixels)])
+        def act(pixels: Tensor) -> TensorDictBase:
+            rows = TensorDict({"pixels": pixels.to(self.half.device)}, [len(pixels)])
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 return self._seeing(self.networks["actor"])(rows)
 
-        fields = self.fields(pictures.over_plane(env, judge))
+        fields = self.fields(over_plane(env, act))
         if fields:
-            pictures.maps(folder, env, fields, offline)
+            maps(folder, env, fields, offline)

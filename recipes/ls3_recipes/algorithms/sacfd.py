@@ -1,59 +1,110 @@
-"""The comparisons: behaviour cloning, SACfD with or without recovery, and AWAC (sections 1.1.2 to 1.1.4)."""
+"""SACfD: soft actor-critic from demonstrations (section 1.1.2), with learnt recovery zones if asked for (1.1.3)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import nn
 from torchrl.envs import TransformedEnv
 from torchrl.objectives import DDPGLoss, SACLoss
+from torchrl.record.loggers import Logger
 
-import pictures
-from common import RunFolder
-from comparison import DEMONSTRATIONS, Comparison
-from learning import Learner
-from ls3_torchrl.baselines import (
-    AWACLoss,
-    RecoveryPolicy,
-    SafetyCritic,
-    SafetyCriticLoss,
-    action_value,
-    deterministic_actor,
-)
+from ls3_recipes.algorithms.actor_critic import ActorCritic
+from ls3_recipes.algorithms.base import Label
+from ls3_recipes.algorithms.baseline import DEMONSTRATIONS, ActorCriticSettings, BaselineSettings
+from ls3_recipes.options import as_dict
+from ls3_recipes.plots.plane import Field
+from ls3_recipes.run_settings import at_least, positive
+from ls3_torchrl.baselines import RecoveryPolicy, SafetyCritic, SafetyCriticLoss, deterministic_actor
 from ls3_torchrl.data import ALL_TAGS, Tag, TaggedReplayBuffer
-from protocol import follow
 
 
-class BehaviourCloning(Comparison):
-    """The floor: the demonstrations imitated."""
+@dataclass(frozen=True, kw_only=True)
+class RiskSettings:
+    """The safety critic of recovery RL (section 1.1.3).
 
-    name = "bc"
+    Args:
+        gamma: γ_risk, in [0, 1].
+        threshold: ε_risk, in [0, 1]: riskier actions are left to the recovery policy.
+        offline_steps: gradient steps on the offline data.
+    """
 
-    def build(self, build: Callable[..., Any]) -> dict[str, nn.Module]:
-        """An actor without noise."""
-        return {"actor": build(deterministic_actor)}
+    gamma: float
+    threshold: float
+    offline_steps: int
+
+    def __post_init__(self) -> None:
+        """Refuse what is no probability."""
+        for name in ("gamma", "threshold"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}.")
+        at_least(self.offline_steps, 0, "offline_steps")
 
 
-class SACfD(Comparison):
+@dataclass(frozen=True, kw_only=True)
+class SACfDPolicySettings(ActorCriticSettings):
+    """Actor and critics of soft actor-critic.
+
+    Args:
+        alpha: weight of the entropy, for rewards of -1 a step; above 0.
+        learn_alpha: whether it is learnt.
+        risk: of the safety critic.
+    """
+
+    alpha: float = 0.02
+    learn_alpha: bool = False
+    risk: RiskSettings
+
+    def __post_init__(self) -> None:
+        """Refuse what would only fail after time was spent."""
+        super().__post_init__()
+        positive(self.alpha, "alpha")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACfDSettings(BaselineSettings):
+    """What a run of SACfD has.
+
+    Args:
+        recovery: recovery RL: a safety critic, and a policy that takes over where the task's own is too risky.
+    """
+
+    recovery: bool = False
+    policy: SACfDPolicySettings
+
+    def __post_init__(self) -> None:
+        """Refuse what is neither with nor without."""
+        super().__post_init__()
+        if not isinstance(self.recovery, bool):
+            raise ValueError(f"recovery must be true or false, got {self.recovery!r}.")
+
+
+class SACfD(ActorCritic):
     """Soft actor-critic that starts from an imitating actor and a critic of the demonstrations."""
 
-    name = "sacfd"
+    key = name = "sacfd"
+    settings_class = SACfDSettings
+    labels = {  # noqa: RUF012
+        "sacfd_rrl": Label("SACfD+RRL", "#d1495b"),
+        "sacfd": Label("SACfD", "#e0a458"),
+    }
+    settings: SACfDSettings
 
-    def __init__(self, config: DictConfig, env: TransformedEnv, device: torch.device) -> None:
-        self.recovery = bool(config.recovery)
+    def __init__(self, settings: SACfDSettings, env: TransformedEnv, device: torch.device) -> None:
+        self.recovery = settings.recovery
         if self.recovery:
             self.name = "sacfd_rrl"
             self.needs = (Tag.SUCCESS, Tag.CONSTRAINT)
-        super().__init__(config, env, device)
+        super().__init__(settings, env, device)
 
     def build(self, build: Callable[..., Any]) -> dict[str, nn.Module]:
         """Actor and critic; with recovery, a safety critic and a policy that keeps its risk low."""
-        networks = super().build(build) | {"critic": build(action_value)}
+        networks = super().build(build)
         if self.recovery:
             networks |= {"safety_critic": build(SafetyCritic), "recovery": build(deterministic_actor)}
         return networks
@@ -62,10 +113,10 @@ class SACfD(Comparison):
         """The actor, or whoever acts in its place."""
         if not self.recovery:
             return super().act()
-        return RecoveryPolicy(
-            super().act(), self.networks["recovery"], self._safety_critic(), self.options.risk.threshold
-        )
+        threshold = self.settings.policy.risk.threshold
+        return RecoveryPolicy(super().act(), self.networks["recovery"], self._safety_critic, threshold)
 
+    @property
     def _safety_critic(self) -> SafetyCritic:
         critic = self.networks["safety_critic"]
         assert isinstance(critic, SafetyCritic)
@@ -81,52 +132,63 @@ class SACfD(Comparison):
             return offline
         return {tag: episodes.copy().set("task_action", episodes["action"]) for tag, episodes in offline.items()}
 
-    def begin(self, buffer: TaggedReplayBuffer, run: RunFolder, horizon: int) -> None:
+    def begin(self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int) -> None:
         """Make the learners."""
-        super().begin(buffer, run, horizon)
-        options, gamma = self.options, self.config.loss.gamma
+        super().begin(buffer, logger, horizon)
+        policy, sac = self.settings.policy, self._sac_loss()
+        self.critic = self.learner("qvalue", sac, lambda: self.sample(DEMONSTRATIONS), tau=policy.tau)
+        names = ["actor", "qvalue", *(["alpha"] if policy.learn_alpha else [])]
+        self.both = self.learner(names, sac, self._sample_wanted, tau=policy.tau)
+        if self.recovery:
+            self._make_recovery_learners()
+
+    def _sac_loss(self) -> SACLoss:
+        policy, gamma = self.settings.policy, as_dict(self.settings.buffer)["gamma"]
         # In the actions' own units entropies lie this much above those in units of half the box. Without a correction,
         # every step would be rewarded for the units that the actions are measured in.
         offset = float(self.half.log().sum())
-        if not options.learn_alpha:
-            self.bonus = gamma * options.alpha * offset
-        sac = SACLoss(
+        if not policy.learn_alpha:
+            self.bonus = gamma * policy.alpha * offset
+        loss = SACLoss(
             self.networks["actor"],
             self.networks["critic"],
             loss_function="l2",
-            alpha_init=options.alpha,
-            fixed_alpha=not options.learn_alpha,
+            alpha_init=policy.alpha,
+            fixed_alpha=not policy.learn_alpha,
             target_entropy=offset - float(len(self.half)),
         )
-        sac.make_value_estimator(gamma=gamma)
-        how = {"lr": options.lr, "tau": options.tau}
-        seen = (*DEMONSTRATIONS, Tag.ONLINE)
-        self.critic = Learner("qvalue", sac, self.rows(DEMONSTRATIONS), **how)
-        names = ["actor", "qvalue", *(["alpha"] if options.learn_alpha else [])]
-        self.both = Learner(names, sac, self.rows(seen, task_action=self.recovery), **how)
-        if not self.recovery:
-            return
-        risk = SafetyCriticLoss(self._safety_critic(), super().act(), gamma=options.risk.gamma)
-        self.risk = Learner("safety", risk, self.rows(ALL_TAGS), **how)
+        loss.make_value_estimator(gamma=gamma)
+        return loss
+
+    def _make_recovery_learners(self) -> None:
+        policy = self.settings.policy
+        risk = SafetyCriticLoss(self._safety_critic, super().act(), gamma=policy.risk.gamma)
+        self.risk = self.learner("safety", risk, lambda: self.sample(ALL_TAGS), tau=policy.tau)
         safer = DDPGLoss(self.networks["recovery"], self.networks["safety_critic"], delay_value=False)
         safer.set_keys(state_action_value="safety")
-        safer.make_value_estimator(gamma=options.risk.gamma)
-        self.safer = Learner("actor", safer, self.rows(ALL_TAGS), lr=options.lr)
+        safer.make_value_estimator(gamma=policy.risk.gamma)
+        self.safer = self.learner("actor", safer, lambda: self.sample(ALL_TAGS))
+
+    def _sample_wanted(self) -> TensorDictBase:
+        """Of demonstrations and online episodes; with recovery, with the actions that the task's policy wanted."""
+        rows = self.sample((*DEMONSTRATIONS, Tag.ONLINE))
+        return rows.set("action", rows["task_action"]) if self.recovery else rows
 
     def phases(self) -> dict[str, Callable[[], None]]:
         """Cloning, the critic of the demonstrations, and with recovery the risk in all data."""
-        phases = super().phases() | {"critic": lambda: self.critic.train(self.options.critic_steps, "Critic", self.run)}
+        policy = self.settings.policy
+        phases = super().phases() | {"critic": lambda: self.critic.train(policy.critic_steps, "Critic")}
         if self.recovery:
-            phases["risk"] = lambda: self._train_risk(self.options.risk.offline_steps)
+            phases["risk"] = lambda: self._train_risk(policy.risk.offline_steps)
         return phases
 
     def _train_risk(self, steps: int) -> None:
-        self.risk.train(steps, "Safety critic", self.run)
-        self.safer.train(steps, "Recovery policy", self.run)
+        self.risk.train(steps, "Safety critic")
+        self.safer.train(steps, "Recovery policy")
 
-    def train_online(self) -> None:
+    def update(self) -> None:
         """Actor and critic, from demonstrations and online episodes; risk from all data."""
-        self.both.train(self.steps_per_update, "Actor and critic", self.run)
+        super().update()
         if self.recovery:
             self._train_risk(self.steps_per_update)
 
@@ -134,79 +196,11 @@ class SACfD(Comparison):
         """How often the recovery policy took over."""
         return {"recovery_rate": float(episodes["recovered"].float().mean())} if self.recovery else {}
 
-    def fields(self, rows: TensorDictBase) -> dict[str, pictures.Field]:
+    def fields(self, rows: TensorDictBase) -> dict[str, Field]:
         """The critic's value of what the actor would do, and its risk."""
-        fields = {"Value min Q": pictures.Field(least_value(self.both.loss, rows), "viridis")}
+        fields = super().fields(rows)
         if self.recovery:
-            risk = self._safety_critic()(rows)["risk"].flatten()
-            level = self.options.risk.threshold
-            fields["Risk $Q_{risk}$"] = pictures.Field(risk, "OrRd", limits=(0.0, 1.0), level=level)
+            level = self.settings.policy.risk.threshold
+            risk = self._safety_critic(rows)["risk"].flatten()
+            fields["Risk $Q_{risk}$"] = Field(risk, "OrRd", limits=(0.0, 1.0), level=level)
         return fields
-
-
-class AWAC(Comparison):
-    """Advantage weighted actor-critic."""
-
-    name = "awac"
-
-    def build(self, build: Callable[..., Any]) -> dict[str, nn.Module]:
-        """Actor and critic."""
-        return super().build(build) | {"critic": build(action_value)}
-
-    def begin(self, buffer: TaggedReplayBuffer, run: RunFolder, horizon: int) -> None:
-        """Make the learners."""
-        super().begin(buffer, run, horizon)
-        options = self.options
-        awac = AWACLoss(self.networks["actor"], self.networks["critic"], temperature=options.temperature)
-        awac.make_value_estimator(gamma=self.config.loss.gamma)
-        self.both = Learner(["actor", "qvalue"], awac, self.rows(ALL_TAGS), lr=options.lr, tau=options.tau)
-
-    def phases(self) -> dict[str, Callable[[], None]]:
-        """Actor and critic together, on all offline data."""
-        return super().phases() | {
-            "critic": lambda: self.both.train(self.options.critic_steps, "Actor and critic", self.run)
-        }
-
-    def train_online(self) -> None:
-        """Actor and critic, from all data."""
-        self.both.train(self.steps_per_update, "Actor and critic", self.run)
-
-    def fields(self, rows: TensorDictBase) -> dict[str, pictures.Field]:
-        """The critic's value of what the actor would do."""
-        return {"Value min Q": pictures.Field(least_value(self.both.loss, rows), "viridis")}
-
-
-def least_value(loss: SACLoss, rows: TensorDictBase) -> Tensor:
-    """min_i Q_i(s, a) of rows ``[n]``."""
-    values = []
-    for params in loss.qvalue_network_params.unbind(0):
-        with params.to_module(loss.qvalue_network):
-            values.append(loss.qvalue_network(rows.copy())["state_action_value"].flatten())
-    return torch.stack(values).amin(0)
-
-
-def relevant(config: DictConfig) -> DictConfig:
-    """The settings that a comparison has, without those of LS³ alone that a preset brings along."""
-    alone = {"planner", "offline", "optim", "loss", "online"}
-    kept = OmegaConf.masked_copy(config, [str(key) for key in config if str(key) not in alone])
-    for group, names in (
-        ("loss", ("gamma", "success_tail", "frozen_dynamics")),
-        ("online", ("updates", "episodes_per_update", "select")),
-    ):
-        OmegaConf.update(kept, group, OmegaConf.masked_copy(config[group], list(names)), force_add=True)
-    return kept
-
-
-def train(config: DictConfig) -> dict:
-    """Run a comparison's recipe.
-
-    Args:
-        config: the resolved configuration of ``conf/bc.yaml``, ``conf/sacfd.yaml`` or ``conf/awac.yaml``.
-
-    Returns:
-        What is written to ``summary.json``.
-    """
-    return follow(relevant(config), COMPARISONS[config.algorithm])
-
-
-COMPARISONS: dict[str, type[Comparison]] = {"bc": BehaviourCloning, "sacfd": SACfD, "awac": AWAC}
