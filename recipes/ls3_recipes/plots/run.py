@@ -158,7 +158,7 @@ def maps(
     """Fields over the plane, demonstrations drawn in."""
     plane = env.plane()
     assert plane is not None
-    grid, extent = plane
+    grid, extent = plane[:2]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(1, len(fields), figsize=(3.2 * len(fields), 3.0), squeeze=False)
         for axis, (title, field) in zip(axes[0], fields.items(), strict=True):
