@@ -90,12 +90,7 @@ class RunFolder:
     """
 
     def __init__(self, path: str | Path, settings: Mapping[str, Any]) -> None:
-        self.path = Path(path)
-        if self.path.exists():
-            raise FileExistsError(
-                f"The output folder {self.path} exists already, and a run never overwrites another. "
-                "Choose another with output=DIR, or move the old one away."
-            )
+        self.path = require_new(path)
         self.path.mkdir(parents=True)
         (self.path / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(dict(settings))))
         self.write_json("versions.json", versions())
@@ -121,6 +116,21 @@ class RunFolder:
     def close(self) -> None:
         """Flush and close what is open."""
         self.logger.close()
+
+
+def require_new(path: str | Path) -> Path:
+    """The path of an output folder that does not exist yet.
+
+    Raises:
+        FileExistsError: when it does.
+    """
+    path = Path(path)
+    if path.exists():
+        raise FileExistsError(
+            f"The output folder {path} exists already, and no run overwrites another. Choose another with output=DIR, "
+            "or move the old one away."
+        )
+    return path
 
 
 def versions() -> dict[str, str]:

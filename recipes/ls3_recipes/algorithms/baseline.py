@@ -17,7 +17,7 @@ from torchrl.objectives import BCLoss, LossModule
 from torchrl.record.loggers import Logger
 
 from ls3_recipes.algorithms.base import Algorithm, make_agent
-from ls3_recipes.plots.agent import reconstructions
+from ls3_recipes.plots.agent import plot_reconstructions
 from ls3_recipes.plots.plane import Field, maps, over_plane, plane_of
 from ls3_recipes.run_settings import RunSettings, at_least, one_of, positive
 from ls3_torchrl import LS3Agent
@@ -212,7 +212,7 @@ class Baseline(Algorithm):
     def plot(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> None:
         """Reconstructions of the VAE; value and risk over the plane where the states are one."""
         if self.vae is not None:
-            reconstructions(folder, self.vae, offline)
+            plot_reconstructions(folder, self.vae, offline)
         env = plane_of(self.settings.task)
         if env is None:
             return

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from ls3_torchrl import LS3Agent
 
 
-def plain_members(sizes: Sequence[int], count: int) -> list[nn.Sequential]:
+def reference_members(sizes: Sequence[int], count: int) -> list[nn.Sequential]:
     """``count`` separate ReLU networks with layers of the given sizes."""
     return [
         nn.Sequential(*(layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU())))[:-1]
@@ -19,13 +19,13 @@ def plain_members(sizes: Sequence[int], count: int) -> list[nn.Sequential]:
     ]
 
 
-class PlainVAE(nn.Module):
-    """The VAE's layers in eager PyTorch with nothing done for speed."""
+class ReferenceVAE(nn.Module):
+    """The VAE's layers as PyTorch has them."""
 
     def __init__(self, agent: LS3Agent) -> None:
         super().__init__()
 
-        def plain(layer: nn.Module) -> nn.Module:
+        def as_is(layer: nn.Module) -> nn.Module:
             for kind in (nn.Conv2d, nn.ConvTranspose2d):
                 if isinstance(layer, kind):
                     (kernel, _), (stride, _) = layer.kernel_size, layer.stride
@@ -33,9 +33,9 @@ class PlainVAE(nn.Module):
             return layer
 
         posterior = next(m for m in agent.encoder.modules() if hasattr(m, "convolutions"))
-        self.convolutions = nn.Sequential(*map(plain, posterior.convolutions))
+        self.convolutions = nn.Sequential(*map(as_is, posterior.convolutions))
         self.head = nn.Linear(256, 2 * agent.encoder.latent_dim)
-        self.decoder = nn.Sequential(*map(plain, agent.decoder.network))
+        self.decoder = nn.Sequential(*map(as_is, agent.decoder.network))
 
     def loss(self, pixels: Tensor) -> Tensor:
         """Equation (1) of images ``[B, C, 64, 64]``, uint8."""

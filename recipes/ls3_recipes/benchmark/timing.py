@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from torch.utils.benchmark import Timer
 
-from common import console
+from ls3_recipes.console import console
 
 _TABLE_WIDTH = 116
 
@@ -91,7 +91,7 @@ def show(rows: list[dict[str, Any]], folder: Path) -> None:
                 f"{row['per_cpu_second']:.0f}" if "per_cpu_second" in row else "",
             )
         )
-    caption = "faster: how many times, than the plain path; of peak: of the largest product's FLOP/s"
+    caption = "faster: how many times, than the reference; of peak: of the largest product's FLOP/s"
     table = Table(title="Benchmark", caption=caption)
     for column in columns:
         table.add_column(column, justify="left" if not column else "right", no_wrap=True)
