@@ -1,4 +1,4 @@
-"""Settings as frozen dataclasses: made from signatures, built from nested mappings, and errors that name the section."""
+"""Settings as frozen dataclasses: made from signatures, built from nested mappings, errors that name the section."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be set in every run, whatever learns: the task, the data, the VAE, how many episodes, how they are judged."""
+"""What can be set in every run, whatever learns: task, data, VAE, number of episodes, evaluation."""
 
 from __future__ import annotations
 

@@ -160,7 +160,9 @@ class Baseline(Algorithm):
             cloning = BCLoss(self.networks["actor"], loss_function=self._distance)
         self.cloning = self.learner("bc", cloning, lambda: self.sample(DEMONSTRATIONS))
 
-    def learner(self, names: str | list[str], loss: LossModule, sample: Callable[[], TensorDictBase], **how: Any) -> Learner:
+    def learner(
+        self, names: str | list[str], loss: LossModule, sample: Callable[[], TensorDictBase], **how: Any
+    ) -> Learner:
         """A learner with the policy's learning rate."""
         return Learner(names, loss, sample, lr=self.settings.policy.lr, logger=self.logger, **how)
 

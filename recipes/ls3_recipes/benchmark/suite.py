@@ -8,7 +8,6 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -138,13 +137,14 @@ def _time_all(
 
 def time_environment_steps(bench: Bench, domain: str, num_envs: int, device: torch.device) -> None:
     """Steps of a domain with pixels, and how many of them a second of one core makes."""
-    env = ls3_envs.make(domain, num_envs=num_envs, seed=0, device=device, horizon=sys.maxsize)  # no episode ends here
+    env = ls3_envs.make(domain, num_envs=num_envs, seed=0, device=device)
     td = env.rand_action(env.reset())
     busy, steps = time.process_time(), 0
 
     def step() -> None:
         nonlocal steps
         steps += num_envs
+        env.base_env._clock.zero_()  # no episode ends here
         env.step(td)
 
     bench.time(f"step with pixels, {domain}, each of {num_envs}", step, per=num_envs)

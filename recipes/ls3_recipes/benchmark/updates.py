@@ -32,7 +32,9 @@ def gradient_step(loss: nn.Module, key: str, rows: TensorDict, precision: str) -
     return take
 
 
-def loop_over_members(inputs: Tensor, sizes: Sequence[int], error: Callable[[Tensor, int], Tensor]) -> Callable[[], None]:
+def loop_over_members(
+    inputs: Tensor, sizes: Sequence[int], error: Callable[[Tensor, int], Tensor]
+) -> Callable[[], None]:
     """The same for separate networks, one after another, on inputs ``[B, M, D]``."""
     networks = [network.to(inputs.device) for network in reference_members(sizes, inputs.shape[1])]
     optimizers = [torch.optim.Adam(network.parameters(), lr=1e-4) for network in networks]
@@ -90,9 +92,7 @@ def _time_loops(bench: Bench, figures: dict[str, str], agent: LS3Agent, rows: Te
     sizes = [shape.latent_dim + shape.action_dim, *shape.dynamics_hidden, 2 * shape.latent_dim]
     bench.time(figures["dynamics"], loop_over_members(torch.cat([latent, rows["action"]], -1), sizes, likelihood))
     sizes = [shape.latent_dim, *shape.value_hidden, 1]
-    bench.time(
-        figures["value"], loop_over_members(latent, sizes, lambda out, m: (out - returns[:, m]).square().mean())
-    )
+    bench.time(figures["value"], loop_over_members(latent, sizes, lambda out, m: (out - returns[:, m]).square().mean()))
 
 
 def time_vae(

@@ -14,7 +14,9 @@ from ls3_recipes.plots.gallery import plot_gallery
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser("ls3 gallery", description="Draw domains: a demonstration and a violation of each.")
+    parser = argparse.ArgumentParser(
+        "ls3 gallery", description="Draw domains: a demonstration and a violation of each."
+    )
     parser.add_argument("file", type=Path, metavar="FILE.png", help="where the picture goes")
     parser.add_argument("--domains", nargs="+", default=list(ls3_envs.DOMAINS), choices=list(ls3_envs.DOMAINS))
     chosen = parser.parse_args(sys.argv[1:] if arguments is None else arguments)

@@ -84,9 +84,7 @@ def maps(
 def _plot_field(axis: Axes, plane: Plane, field: Field) -> object:
     values = field.values.reshape(plane.states.shape[:2]).cpu().numpy()
     low, high = field.limits or (values.min(), values.max())
-    shown = axis.imshow(
-        values, extent=plane.extent, cmap=field.colours, vmin=low, vmax=high, interpolation="nearest"
-    )
+    shown = axis.imshow(values, extent=plane.extent, cmap=field.colours, vmin=low, vmax=high, interpolation="nearest")
     if field.level is not None and values.min() < field.level < values.max():
         x, y = plane.positions(plane.states).unbind(-1)
         axis.contour(x.numpy(), y.numpy(), values, levels=[field.level], colors=INK, linewidths=0.8)

@@ -59,4 +59,18 @@ def image(pixels: Tensor) -> np.ndarray:
     return pixels[-3:].permute(1, 2, 0).cpu().numpy()
 
 
-__all__ = ["GOAL", "INK", "PALE", "SAFE", "STYLE", "UNSAFE", "Axes", "Figure", "grid", "image", "line", "picture", "plt"]
+__all__ = [
+    "GOAL",
+    "INK",
+    "PALE",
+    "SAFE",
+    "STYLE",
+    "UNSAFE",
+    "Axes",
+    "Figure",
+    "grid",
+    "image",
+    "line",
+    "picture",
+    "plt",
+]
