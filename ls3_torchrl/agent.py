@@ -52,7 +52,8 @@ class AgentArchitecture:
         initial_value: where the value networks' output biases start.
         propagation: ``"ts1"`` or ``"tsinf"``; see :class:`~ls3_torchrl.modules.EnsembleDynamics`.
         control_affine: the dynamics' change of the latent is affine in the action.
-        action_scale: unit of the actions in the dynamics, one number or one for each of A.
+        action_scale: unit of the actions in the dynamics, one number or one for each of A. :class:`LS3Agent` also takes
+            ``"box"``, half the range of the actions.
         background: the decoder draws on top of a fixed image.
 
     Raises:
@@ -80,8 +81,7 @@ class AgentArchitecture:
         for name in ("action_dim", "in_channels", "latent_dim", "num_dynamics", "num_values"):
             require_at_least(getattr(self, name), 1, name)
         for name in ("dynamics_hidden", "value_hidden", "classifier_hidden"):
-            for size in getattr(self, name):
-                require_at_least(size, 1, name)
+            object.__setattr__(self, name, tuple(require_at_least(size, 1, name) for size in getattr(self, name)))
         require_choice(self.propagation, ("ts1", "tsinf"), "propagation")
 
 
@@ -89,7 +89,9 @@ def _plain(value: Any) -> Any:
     """Numbers and tuples of them instead of those of NumPy, PyTorch or a configuration."""
     if hasattr(value, "tolist"):
         value = value.tolist()
-    return tuple(_plain(item) for item in value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+    return (
+        tuple(_plain(item) for item in value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+    )
 
 
 def _one_action(spec: TensorSpec) -> Bounded:
@@ -160,15 +162,35 @@ class LS3Agent(nn.Module):
             action_dim = self.action_spec.shape[-1]
         self.planner_settings = dict(planner or {})
         self.task = task
+        if isinstance(architecture.get("action_scale"), str):
+            architecture["action_scale"] = self._half_range(architecture["action_scale"])
         self.architecture = shape = AgentArchitecture(action_dim, **architecture)
         given = dict(zip(PARTS, (encoder, decoder, dynamics, value, safe_set, constraint, goal), strict=True))
         #: Names of the modules that were given from outside.
         self.foreign = tuple(name for name, module in given.items() if module is not None)
         if encoder is None:
             encoder = PixelEncoder(shape.in_channels, shape.latent_dim)
-            decoder = decoder or PixelDecoder(shape.in_channels, shape.latent_dim, background=shape.background)
+            if decoder is None:
+                decoder = PixelDecoder(shape.in_channels, shape.latent_dim, background=shape.background)
         self.encoder, self.decoder = encoder, decoder
-        self.dynamics = dynamics or EnsembleDynamics(
+        self.dynamics = self._make_dynamics() if dynamics is None else dynamics
+        self.value = self._make_value() if value is None else value
+        size, hidden = shape.latent_dim, shape.classifier_hidden
+        self.safe_set = SafeSet(size, hidden=hidden) if safe_set is None else safe_set
+        self.constraint = ConstraintEstimator(size, hidden=hidden) if constraint is None else constraint
+        self.goal = GoalEstimator(size, hidden=hidden) if goal is None else goal
+
+    def _half_range(self, word: str) -> list[float]:
+        """What ``action_scale="box"`` stands for: half the actions' range."""
+        require_choice(word, ("box",), "action_scale, where it is a word,")
+        if self.action_spec is None:
+            raise ValueError("action_scale='box' needs the actions' bounds: pass action_spec=env.action_spec.")
+        space = self.action_spec.space
+        return ((space.high - space.low) / 2).tolist()
+
+    def _make_dynamics(self) -> EnsembleDynamics:
+        shape = self.architecture
+        return EnsembleDynamics(
             shape.latent_dim,
             shape.action_dim,
             num_members=shape.num_dynamics,
@@ -177,15 +199,15 @@ class LS3Agent(nn.Module):
             control_affine=shape.control_affine,
             action_scale=shape.action_scale,
         )
-        self.value = value or ValueEnsemble(
+
+    def _make_value(self) -> ValueEnsemble:
+        shape = self.architecture
+        return ValueEnsemble(
             shape.latent_dim,
             num_members=shape.num_values,
             hidden=shape.value_hidden,
             initial_value=shape.initial_value,
         )
-        self.safe_set = safe_set or SafeSet(shape.latent_dim, hidden=shape.classifier_hidden)
-        self.constraint = constraint or ConstraintEstimator(shape.latent_dim, hidden=shape.classifier_hidden)
-        self.goal = goal or GoalEstimator(shape.latent_dim, hidden=shape.classifier_hidden)
 
     def planner(self, action_spec: TensorSpec | None = None, **settings: Any) -> LS3Planner:
         """The policy: an :class:`~ls3_torchrl.planners.LS3Planner` over this agent's modules.
