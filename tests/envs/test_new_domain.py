@@ -115,7 +115,9 @@ def test_it_can_be_made_and_keeps_the_bases_promises(ferry):
     episode = env.rollout(5)
     assert episode["next", "truncated"][..., 0].tolist() == [[False] * 4 + [True]] * 3
     alone = ls3_envs.make(ferry, num_envs=1, horizon=5, seed=0)
-    assert torch.equal(alone.reset()["state"][0], ls3_envs.make(ferry, num_envs=3, horizon=5, seed=0).reset()["state"][0])
+    assert torch.equal(
+        alone.reset()["state"][0], ls3_envs.make(ferry, num_envs=3, horizon=5, seed=0).reset()["state"][0]
+    )
 
 
 def test_its_offline_data_are_collected(ferry):
