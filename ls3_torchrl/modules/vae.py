@@ -28,30 +28,24 @@ _INITIAL_LOG_SCALE = -3.0
 _FEW_CHANNELS = 16
 
 
-def as_unit_pixels(pixels: Tensor, channels: int) -> Tensor:
-    """Images as float32 in [0, 1].
+def as_unit_pixels(pixels: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Images of any size as floats in [0, 1].
 
     Args:
-        pixels: ``[*B, C, 64, 64]``, uint8 in 0…255, or floating point already in [0, 1].
-        channels: the C that is expected.
+        pixels: ``[*B, C, H, W]``, uint8 in 0…255, or floating point already in [0, 1].
+        dtype: of the floats.
 
     Raises:
-        ValueError: for another shape, or floats that are not finite.
+        ValueError: for floats that are not finite.
         TypeError: for another dtype.
     """
-    if pixels.ndim < 3 or tuple(pixels.shape[-3:]) != (channels, IMAGE_SIZE, IMAGE_SIZE):
-        raise ValueError(
-            f"Pixels must have shape [*B, {channels}, {IMAGE_SIZE}, {IMAGE_SIZE}] (channels first), "
-            f"got {list(pixels.shape)}. Resize or permute the images, or build the encoder with in_channels "
-            "= 3 x stacked frames."
-        )
     if pixels.ndim == 4:  # the convolutions' own order of memory, taken on while the images are small
         pixels = pixels.contiguous(memory_format=torch.channels_last)
     if pixels.dtype == torch.uint8:
-        return pixels.float().div_(255.0)
+        return pixels.to(dtype).div_(255.0)
     if pixels.is_floating_point():
         require_finite(pixels, "The image batch")
-        return pixels.float()
+        return pixels.to(dtype)
     raise TypeError(f"Pixels must be uint8 in 0..255 or floating point in [0, 1], got {pixels.dtype}.")
 
 
@@ -151,10 +145,18 @@ class _ConvolutionalPosterior(nn.Module):
         self.to_params = NormalParamExtractor(scale_mapping="exp", scale_lb=min_scale)
 
     def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        images = as_unit_pixels(pixels, self.in_channels)
+        if pixels.ndim < 3 or tuple(pixels.shape[-3:]) != (self.in_channels, IMAGE_SIZE, IMAGE_SIZE):
+            raise ValueError(
+                f"Pixels must have shape [*B, {self.in_channels}, {IMAGE_SIZE}, {IMAGE_SIZE}] (channels first), "
+                f"got {list(pixels.shape)}. Resize or permute the images, or build the encoder with in_channels "
+                "= 3 x stacked frames."
+            )
+        dtype = self.head.weight.dtype
+        images = as_unit_pixels(pixels, dtype)
         batch = images.shape[:-3]
         images = images.reshape(-1, *images.shape[-3:]).contiguous(memory_format=torch.channels_last)
-        loc, scale = self.to_params(self.head(self.convolutions(images)).float())
+        # Not in the lower precision of autocast: it cannot tell means that are close together.
+        loc, scale = self.to_params(self.head(self.convolutions(images)).to(dtype))
         return loc.reshape(*batch, -1), scale.reshape(*batch, -1)
 
 
@@ -243,11 +245,11 @@ class PixelDecoder(TensorDictModuleBase):
     Args:
         out_channels: C, 3 × stacked frames.
         latent_dim: D.
-        background: add what the network draws to a fixed image, :attr:`background` ``[C, 64, 64]``, black until
+        background: add the network's output to a fixed image, :attr:`background` ``[C, 64, 64]``, black until
             :meth:`set_background` is called. With the mean image, the network need not learn it before it sees what
             moves. The paper has none.
         latent_key: where latents ``[*B, D]`` are read.
-        reco_key: where images ``[*B, C, 64, 64]`` in about [0, 1] are written, float32.
+        reco_key: where images ``[*B, C, 64, 64]`` in about [0, 1] are written, in the latents' dtype.
 
     Raises:
         KeyError: when the latent is missing.
@@ -288,7 +290,7 @@ class PixelDecoder(TensorDictModuleBase):
 
     @torch.no_grad()
     def set_background(self, image: Tensor) -> None:
-        """Draw on top of an image from now on.
+        """Add the network's output to an image from now on.
 
         Args:
             image: ``[C, 64, 64]``, floats in [0, 1], such as the mean of all images.
@@ -312,7 +314,7 @@ class PixelDecoder(TensorDictModuleBase):
         """Write the reconstruction of the latent."""
         require_keys(tensordict, self.in_keys, "PixelDecoder")
         latent = tensordict.get(self.in_keys[0])
-        images = self.network(latent.reshape(-1, latent.shape[-1])).float()
+        images = self.network(latent.reshape(-1, latent.shape[-1])).to(latent.dtype)
         if self.background is not None:
             images = images + self.background
         return tensordict.set(self.out_keys[0], images.reshape(*latent.shape[:-1], *images.shape[-3:]))

@@ -92,7 +92,7 @@ class LatentEnv(ModelBasedEnvBase):
             members = tensordict.get(key, None)
             if members is None:
                 rows = out.batch_size.numel()
-                members = self.dynamics.draw_members(rows, device=self.device).reshape(*out.batch_size, 1)
+                members = self.dynamics.sample_members(rows, device=self.device).reshape(*out.batch_size, 1)
             out.set(key, members)
         return out
 

@@ -158,8 +158,8 @@ def test_drawn_noise_has_the_members_scale():
 
 
 @pytest.mark.parametrize(("rows", "members"), [(20, 5), (7, 5), (3, 5), (1, 1), (11, 2)])
-def test_draw_members_splits_as_evenly_as_can_be(rows: int, members: int):
-    drawn = EnsembleDynamics(1, 1, num_members=members, hidden=()).draw_members(rows)
+def test_sample_members_splits_as_evenly_as_can_be(rows: int, members: int):
+    drawn = EnsembleDynamics(1, 1, num_members=members, hidden=()).sample_members(rows)
     counts = torch.bincount(drawn, minlength=members)
     assert drawn.dtype == torch.int64
     assert counts.sum() == rows
@@ -170,7 +170,7 @@ def test_draw_members_splits_as_evenly_as_can_be(rows: int, members: int):
 def test_every_member_is_as_likely_as_another_for_a_row():
     dynamics = EnsembleDynamics(1, 1, num_members=5, hidden=())
     # With 3 rows for 5 members the remainder must rotate too, else two members would never be drawn.
-    draws = torch.stack([dynamics.draw_members(3) for _ in range(2000)])
+    draws = torch.stack([dynamics.sample_members(3) for _ in range(2000)])
     for row in range(3):
         share = torch.bincount(draws[:, row], minlength=5) / 2000
         torch.testing.assert_close(share, torch.full((5,), 0.2), atol=0.04, rtol=0)
