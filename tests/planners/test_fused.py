@@ -7,10 +7,10 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.data import Bounded
 
+from ls3_torchrl.layers import fastest_precision
 from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
 from ls3_torchrl.planners import FusedImagination, ImaginationNoise, LatentEnv, RolloutImagination, feasible
 from ls3_torchrl.planners.imagination import Limits
-from ls3_torchrl.planners.layers import fastest_precision
 
 D, A, M = 4, 2, 3
 B, N, H, P = 2, 7, 3, 4
@@ -262,7 +262,7 @@ def test_auto_settles_on_what_was_measured():
     imagine = fused_of(build(), precision="auto")
     imagine(*problem())
     expected = {"fp32": torch.float32, "bf16": torch.bfloat16}[fastest_precision("cpu")]
-    assert imagine._dtype == expected
+    assert imagine._snapshot.dtype == expected
 
 
 def test_unknown_precision_is_refused():

@@ -27,7 +27,7 @@ D, A = 4, 2
 SMALL = {"horizon": 3, "num_candidates": 24, "num_elites": 4, "num_particles": 3, "optim_steps": 2, "precision": "fp32"}
 
 
-def judge(kind, *, prob=None, slope=0.0, offset=0.0, axis=0):
+def classifier(kind, *, prob=None, slope=0.0, offset=0.0, axis=0):
     """A classifier of one probability everywhere, or of logit slope * (z_axis - offset)."""
     module = kind(D, hidden=())
     with torch.no_grad():
@@ -37,7 +37,7 @@ def judge(kind, *, prob=None, slope=0.0, offset=0.0, axis=0):
 
 
 def never(kind):
-    return judge(kind, prob=0.001)
+    return classifier(kind, prob=0.001)
 
 
 def stub_planner(
@@ -57,7 +57,7 @@ def stub_planner(
         goal or never(GoalEstimator),
         action_spec=Bounded(low=-1.0, high=1.0, shape=(A,)) if spec is None else spec,
     )
-    return LS3Planner(env, values, safe_set or judge(SafeSet, prob=0.99), encoder, **(SMALL | options))
+    return LS3Planner(env, values, safe_set or classifier(SafeSet, prob=0.99), encoder, **(SMALL | options))
 
 
 def random_planner(propagation="ts1", *, constraint_bias=0.0, **options):
@@ -102,7 +102,9 @@ def test_the_plan_maximises_value():
 def test_every_imagined_step_in_the_goal_counts_one():
     torch.manual_seed(0)
     # The first of three steps can already reach the goal set at x > 0.5 from x = 0; the value is the same everywhere.
-    planner = stub_planner(value=(0.0,) * 4, goal=judge(GoalEstimator, slope=100.0, offset=0.5), num_candidates=200)
+    planner = stub_planner(
+        value=(0.0,) * 4, goal=classifier(GoalEstimator, slope=100.0, offset=0.5), num_candidates=200
+    )
     out = planner(TensorDict({"latent": torch.zeros(1, D)}, [1]))
     assert out["plan", "score"].item() == 3.0
     assert out["action"][0, 0] > 0.5
@@ -112,7 +114,10 @@ def test_plans_stop_short_of_the_constraint():
     torch.manual_seed(0)
     # V pulls to the right, where the constraint begins at x = 1: f_C ≤ 0.2 needs x ≤ 1 - log(4) / 50 = 0.972.
     planner = stub_planner(
-        constraint=judge(ConstraintEstimator, slope=50.0, offset=1.0), num_candidates=300, num_elites=10, optim_steps=6
+        constraint=classifier(ConstraintEstimator, slope=50.0, offset=1.0),
+        num_candidates=300,
+        num_elites=10,
+        optim_steps=6,
     )
     result = planner.plan(torch.tensor([[0.5, 0.0, 0.0, 0.0]]))
     path = 0.5 + result.actions[0, :, 0].cumsum(0)
@@ -126,8 +131,8 @@ def test_only_the_end_of_a_plan_must_be_safe():
     # Safe (≥ 0.8) for x ≤ 1 - log(4) / 50; the goal further right pays for every step there but the last.
     planner = stub_planner(
         value=(0.0,) * 4,
-        goal=judge(GoalEstimator, slope=50.0, offset=1.2),
-        safe_set=judge(SafeSet, slope=-50.0, offset=1.0),
+        goal=classifier(GoalEstimator, slope=50.0, offset=1.2),
+        safe_set=classifier(SafeSet, slope=-50.0, offset=1.0),
         num_candidates=300,
         num_elites=10,
         optim_steps=6,
@@ -163,9 +168,9 @@ def test_actions_lie_within_asymmetric_bounds_and_reach_them():
 
 def test_one_elite_and_one_round_is_random_shooting():
     planner = stub_planner(num_elites=1, optim_steps=1)
-    noise = planner.draw_noise(2)
+    noise = planner.sample_noise(2)
     out = planner(TensorDict({"latent": torch.zeros(2, D)}, [2]), noise=noise)
-    candidates = -1 + 2 * noise.uniform[0]  # [B, N, H, A]
+    candidates = -1 + 2 * noise.candidates[1][0]  # [B, N, H, A]
     best = candidates[..., 0].sum(-1).argmax(-1)
     torch.testing.assert_close(out["action"], candidates[torch.arange(2), best, 0])
 
@@ -175,7 +180,7 @@ def test_one_elite_and_one_round_is_random_shooting():
 
 @pytest.mark.parametrize(("prob", "k"), [(0.9, 0), (0.7, 1), (0.6, 2), (0.45, 3), (0.3, 5)])
 def test_the_threshold_is_relaxed_as_often_as_needed_and_no_further(prob, k):
-    planner = stub_planner(safe_set=judge(SafeSet, prob=prob))
+    planner = stub_planner(safe_set=classifier(SafeSet, prob=prob))
     out = planner(latents(1))
     # 0.8, 0.64, 0.512, 0.4096, 0.32768, 0.262144
     assert out["plan", "safe_set_threshold"].item() == pytest.approx(0.8 * 0.8**k)
@@ -185,7 +190,7 @@ def test_the_threshold_is_relaxed_as_often_as_needed_and_no_further(prob, k):
 
 def test_each_row_relaxes_for_itself():
     # f_S depends on z_2, which no action moves: 0.9, 0.7 and 0.45 for the three rows.
-    safe_set = judge(SafeSet, slope=1.0, offset=0.0, axis=2)
+    safe_set = classifier(SafeSet, slope=1.0, offset=0.0, axis=2)
     start = torch.zeros(3, D)
     start[:, 2] = torch.tensor([0.9, 0.7, 0.45]).logit()
     out = stub_planner(safe_set=safe_set)(TensorDict({"latent": start}, [3]))
@@ -195,7 +200,9 @@ def test_each_row_relaxes_for_itself():
 
 
 def test_relaxation_and_its_limit_are_settings():
-    planner = stub_planner(safe_set=judge(SafeSet, prob=0.2), safe_set_threshold=0.6, relaxation=0.5, max_relaxations=1)
+    planner = stub_planner(
+        safe_set=classifier(SafeSet, prob=0.2), safe_set_threshold=0.6, relaxation=0.5, max_relaxations=1
+    )
     out = planner(latents(1))
     assert out["plan", "safe_set_threshold"].item() == pytest.approx(0.3)
     assert out["plan", "fallback"].all()
@@ -206,19 +213,19 @@ def test_relaxation_and_its_limit_are_settings():
 def test_without_a_feasible_plan_the_least_harmful_is_taken_not_a_random_one(engine):
     # Violating everywhere; the end is the safer the further right: the best of the last iteration is known.
     planner = stub_planner(
-        constraint=judge(ConstraintEstimator, prob=0.9),
-        safe_set=judge(SafeSet, slope=0.5, offset=4.0),
+        constraint=classifier(ConstraintEstimator, prob=0.9),
+        safe_set=classifier(SafeSet, slope=0.5, offset=4.0),
         value=(-1.0, 0.0, 0.0, 0.0),  # the value would pull the other way
         max_relaxations=2,
         engine=engine,
     )
-    noise = planner.draw_noise(2)
+    noise = planner.sample_noise(2)
     out = planner(TensorDict({"latent": torch.zeros(2, D)}, [2]), noise=noise)
     assert out["plan", "fallback"].all()
     assert not out["plan", "feasible"].any()
     assert out["plan", "iterations"].flatten().tolist() == [3, 3]
     torch.testing.assert_close(out["plan", "safe_set_threshold"], torch.full((2, 1), 0.8 * 0.8**2))
-    candidates = -1 + 2 * noise.uniform[2]
+    candidates = -1 + 2 * noise.candidates[1][2]
     best = candidates[..., 0].sum(-1).argmax(-1)
     torch.testing.assert_close(out["action"], candidates[torch.arange(2), best, 0])
     assert_in_box(out["action"], planner.action_spec)
@@ -228,8 +235,8 @@ def test_a_fallback_prefers_fewer_violations_to_a_safer_end():
     torch.manual_seed(0)
     # Right of x = 1 violates, but only there lies the safe set, and the start is inside the violation.
     planner = stub_planner(
-        constraint=judge(ConstraintEstimator, slope=100.0, offset=1.0),
-        safe_set=judge(SafeSet, slope=2.0, offset=6.0),
+        constraint=classifier(ConstraintEstimator, slope=100.0, offset=1.0),
+        safe_set=classifier(SafeSet, slope=2.0, offset=6.0),
         num_candidates=300,
         max_relaxations=0,
     )
@@ -243,7 +250,7 @@ def test_a_fallback_prefers_fewer_violations_to_a_safer_end():
 def test_describe_plan_by_hand():
     plan = {
         "fallback": torch.tensor([[[False], [True]], [[False], [False]]]),
-        "safe_set_threshold": torch.tensor([[[0.8], [0.26]], [[0.64], [0.8]]]),
+        "relaxed": torch.tensor([[[False], [True]], [[True], [False]]]),
         "iterations": torch.tensor([[[4], [6]], [[5], [4]]]),
     }
     described = describe_plan(TensorDict({"me": {"plan": plan}}, [2, 2]), plan_key=("me", "plan"))
@@ -262,7 +269,7 @@ def test_both_engines_pick_the_same_actions(propagation, reduction, common):
     fused, plain = (random_planner(propagation, engine=engine, **options) for engine in ("fused", "rollout"))
     assert isinstance(fused.imagine, FusedImagination)
     assert isinstance(plain.imagine, RolloutImagination)
-    noise = fused.draw_noise(4)
+    noise = fused.sample_noise(4)
     one, other = (planner(latents(4), noise=noise) for planner in (fused, plain))
     torch.testing.assert_close(one["action"], other["action"], atol=1e-4, rtol=1e-4)
     for name in ("feasible", "fallback", "iterations"):
@@ -284,7 +291,7 @@ def test_a_row_of_a_batch_is_planned_as_if_alone(engine, common):
         "std": 0.1 + 0.4 * torch.rand(6, 3, A),
     }
     start["is_init"] = torch.tensor([True, False] * 3).unsqueeze(-1)
-    noise = planner.draw_noise(6)
+    noise = planner.sample_noise(6)
     together = planner(start.clone(), noise=noise)
     # Rows at different rounds at the same time, or the test would show little.
     assert together["plan", "iterations"].unique().numel() > 1
@@ -298,25 +305,25 @@ def test_a_row_of_a_batch_is_planned_as_if_alone(engine, common):
 
 def test_given_noise_makes_a_plan_repeatable_and_leaves_the_generator_alone():
     planner = random_planner(common_noise=False)
-    noise, start = planner.draw_noise(2), latents(2)
+    noise, start = planner.sample_noise(2), latents(2)
     before = torch.get_rng_state()
     one, two = (planner(start.clone(), noise=noise)["action"] for _ in range(2))
     assert torch.equal(one, two)
     assert torch.equal(before, torch.get_rng_state())
-    assert not torch.equal(one, planner(start.clone(), noise=planner.draw_noise(2))["action"])
+    assert not torch.equal(one, planner(start.clone(), noise=planner.sample_noise(2))["action"])
 
 
 @pytest.mark.parametrize("common", [True, False])
 def test_the_shapes_of_all_noise(common):
     planner = random_planner("tsinf", common_noise=common, max_relaxations=1)
-    noise = planner.draw_noise(5)
+    noise = planner.sample_noise(5)
     iterations = 2 * 2  # rounds × (1 + relaxations)
-    assert noise.normal.shape == noise.uniform.shape == (iterations, 5, 24, 3, A)
+    assert noise.candidates[0].shape == noise.candidates[1].shape == (iterations, 5, 24, 3, A)
     assert noise.members.shape == (iterations, 3, 3)
     assert (noise.members == noise.members[:, :1]).all()
     assert noise.dynamics.shape == (iterations, 5, 3, 3, 1 if common else 24, D)
     assert noise.row(2).dynamics.shape[1] == 1
-    assert torch.equal(noise.row(2).normal[:, 0], noise.normal[:, 2])
+    assert torch.equal(noise.row(2).candidates[0][:, 0], noise.candidates[0][:, 2])
 
 
 @pytest.mark.parametrize("engine", ["fused", "rollout"])
@@ -332,7 +339,7 @@ def test_any_batch_shape_goes(engine, batch):
 
 def test_rows_of_a_two_dimensional_batch_keep_their_place():
     planner = random_planner()
-    noise, start = planner.draw_noise(6), latents(6)
+    noise, start = planner.sample_noise(6), latents(6)
     flat = planner(start.clone(), noise=noise)
     square = planner(start.clone().reshape(2, 3), noise=noise)
     assert torch.equal(square["action"].reshape(6, A), flat["action"])
@@ -343,7 +350,7 @@ def test_rows_of_a_two_dimensional_batch_keep_their_place():
 
 def still(noise: PlanNoise) -> PlanNoise:
     """Without candidate noise every candidate is its Gaussian's mean."""
-    return noise._replace(normal=torch.zeros_like(noise.normal))
+    return noise._replace(candidates=(torch.zeros_like(noise.candidates[0]), noise.candidates[1]))
 
 
 def test_a_row_that_was_reset_starts_afresh_while_others_stay_warm():
@@ -358,14 +365,14 @@ def test_a_row_that_was_reset_starts_afresh_while_others_stay_warm():
         },
         [2],
     )
-    out = planner(start, noise=still(planner.draw_noise(2)))
+    out = planner(start, noise=still(planner.sample_noise(2)))
     torch.testing.assert_close(out["action"], torch.tensor([[-2.0, 1.25], [-1.5, 1.5]]))
 
 
 def test_the_next_steps_start_is_the_plan_shifted_with_a_wide_open_end():
     spec = Bounded(low=torch.tensor([-3.0, 0.5]), high=torch.tensor([-1.0, 2.0]), shape=(A,))
     planner = stub_planner(spec=spec)
-    noise = planner.draw_noise(2)
+    noise = planner.sample_noise(2)
     start = torch.zeros(2, D)
     result = planner.plan(start, noise=noise)
     out = planner(TensorDict({"latent": start}, [2]), noise=noise)
@@ -382,7 +389,7 @@ def test_a_start_without_spread_is_none():
     planner = stub_planner(spec=spec, p_random=0.0)
     zeros = torch.zeros(1, 3, A)
     start = TensorDict({"latent": torch.zeros(1, D), "plan": {"mean": zeros, "std": zeros}}, [1])
-    out = planner(start, noise=still(planner.draw_noise(1)))
+    out = planner(start, noise=still(planner.sample_noise(1)))
     torch.testing.assert_close(out["action"], torch.tensor([[-2.0, 1.25]]))
 
 
@@ -417,7 +424,7 @@ class Corridor(EnvBase):
 
 def corridor(planner, rows=2):
     env = TransformedEnv(Corridor(rows), InitTracker())
-    env.append_transform(planner.primer())
+    env.append_transform(planner.make_tensordict_primer())
     return env
 
 
@@ -468,7 +475,7 @@ def test_the_carried_start_is_what_the_next_plan_begins_with():
     planner = stub_planner(p_random=0.0, min_std=0.05)
     env = corridor(planner)
     # Noise free: the first plan is the middle of the box, so make the second start elsewhere by hand.
-    noise = still(planner.draw_noise(2))
+    noise = still(planner.sample_noise(2))
     state = env.reset()
     state = planner(state, noise=noise)
     state["next", "plan", "mean"] = torch.full((2, 3, A), 0.25)
@@ -488,7 +495,7 @@ def test_all_keys_may_be_nested(engine):
         "is_init_key": ("see", "first"),
     }
     plain, nested = random_planner(engine=engine, p_random=0.5), random_planner(engine=engine, p_random=0.5, **keys)
-    noise = plain.draw_noise(2)
+    noise = plain.sample_noise(2)
     mean, std = torch.tensor([-2.0, 1.0]).expand(2, 3, A), torch.full((2, 3, A), 0.3)
     first, latent = torch.tensor([[True], [False]]), latents(2)["latent"]
     one = plain(TensorDict({"latent": latent, "is_init": first, "plan": {"mean": mean, "std": std}}, [2]), noise=noise)
@@ -498,7 +505,11 @@ def test_all_keys_may_be_nested(engine):
     assert torch.equal(one["plan", "score"], two["agent", "plan", "score"])
     assert torch.equal(one["next", "plan", "mean"], two["next", "agent", "plan", "mean"])
     assert "action" not in set(two.keys())
-    assert nested.in_keys == [("see", "latent")]
+    assert nested.in_keys == [
+        ("see", "latent"),
+        *(("agent", "plan", name) for name in ("mean", "std")),
+        ("see", "first"),
+    ]
     assert nested.out_keys[:2] == [("agent", "action"), ("agent", "plan", "feasible")]
 
 
@@ -517,7 +528,7 @@ def test_a_latent_that_is_not_finite_is_refused(bad):
 
 def test_planning_returns_the_actions_and_leaves_its_input_alone():
     planner = random_planner()
-    start, noise = latents(2), planner.draw_noise(2)
+    start, noise = latents(2), planner.sample_noise(2)
     actions = planner.planning(start, noise)
     assert list(start.keys()) == ["latent"]
     assert torch.equal(actions, planner(start, noise=noise)["action"])
@@ -573,7 +584,7 @@ def test_probabilities_must_lie_strictly_between_zero_and_one(name, value):
         ({"horizon": 0}, "horizon must be at least 1, got 0"),
         ({"num_particles": 0}, "num_particles must be at least 1"),
         ({"optim_steps": 0}, "optim_steps must be at least 1"),
-        ({"max_relaxations": -1}, "at least 0, got -1"),
+        ({"max_relaxations": -1}, "max_relaxations must be at least 0, got -1"),
         ({"p_random": 1.5}, r"p_random must lie in \[0, 1\]"),
         ({"pessimism": -1.0}, "pessimism must not be negative"),
         ({"noise_scale": -0.1}, "noise_scale must not be negative, got -0.1"),
@@ -604,17 +615,17 @@ def test_auto_takes_the_fast_engine_where_it_can_and_any_module_otherwise():
     assert isinstance(planner.imagine, FusedImagination)
     own = LS3Planner(planner.env, OwnValue(), planner.safe_set, **SMALL)
     assert isinstance(own.imagine, RolloutImagination)
-    noise, start = planner.draw_noise(2), latents(2)
+    noise, start = planner.sample_noise(2), latents(2)
     torch.testing.assert_close(planner(start.clone(), noise=noise)["action"], own(start, noise=noise)["action"])
     with pytest.raises(TypeError, match='engine="rollout"'):
         LS3Planner(planner.env, OwnValue(), planner.safe_set, engine="fused", **SMALL)
 
 
 def test_statistics_judge_given_plans():
-    planner = stub_planner(safe_set=judge(SafeSet, slope=1.0))
+    planner = stub_planner(safe_set=classifier(SafeSet, slope=1.0))
     plans = torch.zeros(1, 2, 3, A)
     plans[0, 1, :, 0] = 1.0
-    seen = planner.statistics(torch.zeros(1, D), plans)
+    seen = planner.imagine_plans(torch.zeros(1, D), plans)
     torch.testing.assert_close(seen.value[0, :, 0], torch.tensor([0.0, 3.0]), atol=1e-4, rtol=0)
     torch.testing.assert_close(seen.safe_set_prob[0], torch.tensor([0.0, 3.0]).sigmoid(), atol=1e-4, rtol=0)
 
@@ -625,11 +636,10 @@ def test_planning_keeps_no_graph():
 
 
 def test_noise_scale_multiplies_the_particles_noise_and_nothing_else():
-    rows = torch.arange(2)
     drawn = {}
     for scale in (0.0, 0.5, 1.0):
         torch.manual_seed(0)
-        drawn[scale] = stub_planner(noise_scale=scale)._draw_imagination(rows, 0)
+        drawn[scale] = stub_planner(noise_scale=scale)._sample_imagination_noise(2, 1)
     assert (drawn[0.0].noise == 0).all()
     torch.testing.assert_close(drawn[0.5].noise, 0.5 * drawn[1.0].noise)
     assert torch.equal(drawn[0.0].members, drawn[1.0].members)

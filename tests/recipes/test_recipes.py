@@ -122,7 +122,7 @@ def test_every_preset_composes_and_fits_the_library(preset):
     agent = LS3Agent(action_dim=2, **agent_options(config, spec))
     planner = agent.planner(spec, **config.planner)
     assert planner.horizon == config.planner.horizon
-    assert planner.cem.num_candidates == config.planner.num_candidates
+    assert planner.optimizer.num_candidates == config.planner.num_candidates
 
 
 @pytest.mark.parametrize("preset", PRESETS)

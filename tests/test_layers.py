@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from ls3_torchrl.planners.layers import fastest_precision, run_layers
+from ls3_torchrl.layers import fastest_precision, run_layers
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

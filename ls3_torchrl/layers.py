@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
+from torchrl.modules import MLP
 
 from ls3_torchrl.modules.ensemble import EnsembleMLP
 
@@ -18,9 +19,17 @@ Layers = list[tuple[Tensor, Tensor]]
 
 
 def is_relu_mlp(network: nn.Module) -> bool:
-    """Whether a network is linear layers with ReLU between them."""
-    return isinstance(network, nn.Sequential) and all(
-        isinstance(layer, nn.Linear if i % 2 == 0 else nn.ReLU) for i, layer in enumerate(network)
+    """Whether a network is linear layers with ReLU between them, and nothing else.
+
+    Types are compared exactly: a subclass of a linear layer, such as a noisy or a parametrised one, computes something
+    else than its weight and bias say.
+    """
+    if type(network) not in (nn.Sequential, MLP):
+        return False
+    layers = list(cast(nn.Sequential, network))
+    return len(layers) % 2 == 1 and all(
+        type(layer) is (nn.Linear if i % 2 == 0 else nn.ReLU) and getattr(layer, "bias", 0) is not None
+        for i, layer in enumerate(layers)
     )
 
 
