@@ -101,13 +101,13 @@ def agreement(agent: LS3Agent, options: dict[str, Any], spec: Bounded, frames: T
     space = exact.action_spec.space
     for frame in frames:
         latent = exact.encode(TensorDict({"pixels": frame[None].to(space.low.device)}, [1]))
-        noise = exact.draw_noise(1)
+        noise = exact.sample_noise(1)
         plans = torch.cat([planner.plan(latent, noise=noise).actions for planner in (exact, rough)])[None]
         drawn = ImaginationNoise(noise.members[0], noise.dynamics[0][:, :, :, :1])
         threshold = torch.full((1, 1), exact.safe_set_threshold, device=latent.device)
         one, other = exact.score_plans(exact.imagine(latent, plans, drawn), threshold).score[0]
         errors.append(float((one - other).abs() / one.abs().clamp(min=1.0)))
-        uniform = torch.rand(1, exact.cem.num_candidates, exact.horizon, *space.low.shape, device=latent.device)
+        uniform = torch.rand(1, exact.optimizer.num_candidates, exact.horizon, *space.low.shape, device=latent.device)
         candidates = space.low + (space.high - space.low) * uniform
         verdicts = [p.score_plans(p.imagine(latent, candidates, drawn), threshold).feasible for p in (exact, rough)]
         disagreeing.append(float((verdicts[0] != verdicts[1]).float().mean()))

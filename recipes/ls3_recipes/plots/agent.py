@@ -133,7 +133,7 @@ def _plot_candidates(
     uniform = torch.rand(1, candidates, horizon, space.low.shape[-1], device=latent.device)
     actions = space.low + (space.high - space.low) * uniform
     threshold = torch.full((1, 1), planner.safe_set_threshold, device=latent.device)
-    feasible = planner.score_plans(planner.statistics(latent, actions), threshold).feasible
+    feasible = planner.score_plans(planner.imagine_plans(latent, actions), threshold).feasible
     chosen = planner.plan(latent).actions
     for action, allowed in zip(actions[0].cpu(), feasible[0].cpu(), strict=True):
         axis.plot(*_path(env, plane, state, action), color=SAFE if allowed else UNSAFE, lw=0.5, alpha=0.45)
