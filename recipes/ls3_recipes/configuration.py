@@ -180,7 +180,7 @@ def run_command(
         groups: folders of ``conf/`` whose files can be chosen.
 
     Raises:
-        SystemExit: with a message, for settings that only other algorithms have.
+        SystemExit: with one line, for settings that cannot be.
     """
     arguments = rename_overrides(arguments)
     overrides = [argument for argument in arguments if not argument.startswith("-")]
@@ -193,7 +193,11 @@ def run_command(
         return
 
     def under_hydra(config: DictConfig) -> None:
-        job(settings_from(config, settings))
+        try:
+            chosen = settings_from(config, settings)
+        except ValueError as error:
+            raise SystemExit(f"ls3 {command}: {error}") from None
+        job(chosen)
 
     sys.argv = [sys.argv[0], *arguments]
     hydra.main(version_base="1.3", config_path=str(CONF), config_name=command)(under_hydra)()

@@ -1,18 +1,19 @@
 """The benchmark runs, writes what it measured, and counts operations as they are."""
 
 import json
-from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from torch import nn
 from torchrl.data import Bounded
 
-import benchmark
+from ls3_recipes.benchmark.planning import agreement, permissive, plan_flops
+from ls3_recipes.benchmark.reference import ReferenceVAE
+from ls3_recipes.benchmark.suite import BenchmarkSettings, run_benchmark
+from ls3_recipes.benchmark.timing import Bench
+from ls3_recipes.commands import benchmark as command
+from ls3_recipes.configuration import compose_settings
 from ls3_torchrl import LS3Agent
-from plain import PlainVAE
-from timing import Bench
 
 
 def test_the_benchmark_writes_its_figures_and_ratios(tmp_path, capsys):
@@ -26,8 +27,7 @@ def test_the_benchmark_writes_its_figures_and_ratios(tmp_path, capsys):
         "smoke=false",
         f"output={out}",
     ]
-    with initialize_config_dir(str(Path(benchmark.__file__).parent / "conf"), version_base="1.3"):
-        benchmark.run(compose("benchmark", settings))
+    run_benchmark(compose_settings("benchmark", BenchmarkSettings, settings))
     written = json.loads((out / "benchmark.json").read_text())
     # Nothing of the table is cut, whatever the terminal's width.
     table, printed = (out / "benchmark.md").read_text(), capsys.readouterr().out
@@ -53,27 +53,27 @@ def test_operations_of_a_plan_by_hand():
     options = {"num_candidates": 11, "num_particles": 2, "optim_steps": 3, "horizon": 5}
     dynamics, head, value = (3 + 2) * 4 + 4 * 6, 3 * 6 + 6 * 1, 3 * 5 + 5 * 1
     by_hand = 2 * 11 * 2 * 3 * (5 * (dynamics + 2 * head) + head + 7 * value)
-    assert benchmark.plan_flops(agent, options) == by_hand
+    assert plan_flops(agent, options) == by_hand
 
 
 def test_every_plan_of_a_permissive_agent_is_feasible():
     torch.manual_seed(0)
-    agent = benchmark.permissive(LS3Agent(2, latent_dim=4))
+    agent = permissive(LS3Agent(2, latent_dim=4))
     planner = agent.planner(Bounded(low=-1.0, high=1.0, shape=(2,)), num_candidates=20, num_elites=2, num_particles=2)
     result = planner.plan(torch.randn(3, 4))
     assert not result.fallback.any()
     assert result.iterations.tolist() == [4, 4, 4]
 
 
-def test_the_plain_vae_has_the_layers_of_the_agents():
+def test_the_reference_vae_has_the_layers_of_the_agents():
     agent = LS3Agent(2, latent_dim=4)
-    plain = PlainVAE(agent)
-    assert sum(p.numel() for p in plain.parameters()) == sum(
+    reference = ReferenceVAE(agent)
+    assert sum(p.numel() for p in reference.parameters()) == sum(
         p.numel() for half in (agent.encoder, agent.decoder) for p in half.parameters()
     )
-    kinds = {type(layer) for layer in plain.modules() if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d))}
+    kinds = {type(layer) for layer in reference.modules() if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d))}
     assert kinds == {nn.Conv2d, nn.ConvTranspose2d}
-    assert plain.loss(torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).isfinite()
+    assert reference.loss(torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).isfinite()
 
 
 def test_bf16_agrees_closely_and_fp32_with_itself_exactly(monkeypatch):
@@ -82,12 +82,12 @@ def test_bf16_agrees_closely_and_fp32_with_itself_exactly(monkeypatch):
     spec = Bounded(low=-1.0, high=1.0, shape=(2,))
     options = {"num_candidates": 60, "num_elites": 6, "num_particles": 2, "horizon": 3, "safe_set_threshold": 0.5}
     frames = torch.randint(256, (4, 3, 64, 64), dtype=torch.uint8)
-    found = benchmark.agreement(agent, options, spec, frames)
+    found = agreement(agent, options, spec, frames)
     assert 0.0 <= found["value_error"] < 0.2
     assert 0.0 <= found["feasibility"] < 0.5
     plan = LS3Agent.planner
     monkeypatch.setattr(LS3Agent, "planner", lambda self, spec, **o: plan(self, spec, **(o | {"precision": "fp32"})))
-    same = benchmark.agreement(agent, options, spec, frames)
+    same = agreement(agent, options, spec, frames)
     assert same["value_error"] < 1e-6  # two plans judged side by side may be summed in another order
     assert same["feasibility"] == 0.0
 
@@ -101,10 +101,23 @@ def test_what_takes_long_is_timed_once():
     assert bench.rows[0]["median_ms"] > 0.0
 
 
-def test_a_benchmark_without_presets_is_refused_before_anything_is_timed(tmp_path):
-    settings = ["presets=[]", f"output={tmp_path / 'bench'}"]
-    with initialize_config_dir(str(Path(benchmark.__file__).parent / "conf"), version_base="1.3"):
-        config = compose("benchmark", settings)
-    with pytest.raises(ValueError, match="at least one preset, such as presets="):
-        benchmark.run(config)
-    assert not (tmp_path / "bench").exists()
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("presets=[]", "at least one preset, such as presets="),
+        ("domains=[moon]", r"domains must be one of navigation, .*got 'moon'"),
+        ("batches=[0]", "batches must be at least 1"),
+        ("seconds=0", "seconds must be positive"),
+    ],
+)
+def test_what_cannot_be_timed_is_refused_before_anything_is(override, message):
+    with pytest.raises(ValueError, match=message):
+        compose_settings("benchmark", BenchmarkSettings, [override])
+
+
+def test_the_former_name_of_the_reference_is_read(monkeypatch):
+    seen = []
+    monkeypatch.setattr(command, "run_command", lambda *arguments, **how: seen.append(arguments[3]))
+    with pytest.warns(UserWarning, match="plain is now called reference"):
+        command.main(["plain=false", "seconds=1"])
+    assert seen == [["reference=false", "seconds=1"]]

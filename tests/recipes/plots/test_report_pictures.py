@@ -5,10 +5,10 @@ import json
 
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 from PIL import Image
 
-import report
+from ls3_recipes.commands.report import ReportSettings, report
+from ls3_recipes.plots.report import mean_and_error, read_run
 
 
 def make_run(folder, algorithm, seed, successes, *, task="navigation", episodes=4, evaluation=-50.0):
@@ -28,11 +28,11 @@ def make_run(folder, algorithm, seed, successes, *, task="navigation", episodes=
 
 
 def settings(tmp_path, *folders):
-    return OmegaConf.create({"runs": [str(f) for f in folders], "output": str(tmp_path / "report")})
+    return ReportSettings(runs=tuple(map(str, folders)), output=str(tmp_path / "report"))
 
 
 def test_a_run_is_read_as_it_was_written(tmp_path):
-    run = report.read_run(make_run(tmp_path / "a", "awac", 3, [0.0, 0.5]))
+    run = read_run(make_run(tmp_path / "a", "awac", 3, [0.0, 0.5]))
     assert (run.algorithm, run.seed) == ("awac", 3)
     assert run.episodes.tolist() == [4, 8]
     assert run.curves["mean_success"].tolist() == [0.0, 0.5]
@@ -41,10 +41,10 @@ def test_a_run_is_read_as_it_was_written(tmp_path):
 
 def test_mean_and_standard_error_by_hand():
     values = np.array([[1.0, 0.0], [3.0, 0.0], [5.0, 3.0]])
-    mean, error = report.mean_and_error(values)
+    mean, error = mean_and_error(values)
     assert mean.tolist() == [3.0, 1.0]
     assert error.tolist() == pytest.approx([2.0 / 3**0.5, 3**0.5 / 3**0.5])
-    mean, error = report.mean_and_error(values[:1])
+    mean, error = mean_and_error(values[:1])
     assert mean.tolist() == [1.0, 0.0]
     assert error.tolist() == [0.0, 0.0]
 
@@ -55,7 +55,7 @@ def test_table_and_picture(tmp_path):
         make_run(tmp_path / "l1", "ls3", 1, [0.5, 1.0], evaluation=-52.0),
         make_run(tmp_path / "l0", "ls3", 0, [0.0, 1.0], evaluation=-50.0),
     ]
-    rows = report.report(settings(tmp_path, *folders))
+    rows = report(settings(tmp_path, *folders))
     assert [(row["algorithm"], row["seeds"]) for row in rows] == [("LS³", "2"), ("Behaviour cloning", "1")]
     assert rows[0]["evaluation return"] == "-51.0 ± 1.0"
     assert rows[0]["evaluation success"] == "100 ± 0 %"
@@ -79,15 +79,15 @@ def test_what_is_not_comparable_is_refused(tmp_path, other, message):
     one = make_run(tmp_path / "one", "ls3", 0, [0.0, 1.0])
     two = make_run(tmp_path / "two", **({"algorithm": "awac", "seed": 1, "successes": [0.0, 1.0]} | other))
     with pytest.raises(ValueError, match=message):
-        report.report(settings(tmp_path, one, two))
+        report(settings(tmp_path, one, two))
     assert not (tmp_path / "report").exists()
 
 
 def test_nothing_and_no_run_are_refused(tmp_path):
     with pytest.raises(ValueError, match="No runs"):
-        report.report(settings(tmp_path))
+        report(settings(tmp_path))
     with pytest.raises(FileNotFoundError, match=r"summary\.json is missing"):
-        report.report(settings(tmp_path, tmp_path))
+        report(settings(tmp_path, tmp_path))
     (tmp_path / "report").mkdir()
     with pytest.raises(FileExistsError, match="exists already"):
-        report.report(settings(tmp_path, tmp_path))
+        report(settings(tmp_path, tmp_path))

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from common import choose_device
+from ls3_recipes.device import choose_device, hardware
 
 
 @pytest.fixture
@@ -27,3 +27,16 @@ def test_the_cpu_keeps_its_precision(monkeypatch, precision, name):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert choose_device(name) == torch.device("cpu")
     assert precision() == "highest"
+
+
+def test_cuda_without_a_device_is_refused_with_a_remedy(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match=r"device=cuda was asked for, but PyTorch sees no CUDA device\. Use device=cpu"):
+        choose_device("cuda")
+
+
+def test_the_hardware_is_described():
+    found = hardware(torch.device("cpu"))
+    assert set(found) == {"cpu", "cores", "threads", "gpu"}
+    assert found["threads"] == torch.get_num_threads()
+    assert found["gpu"] == "none"

@@ -1,115 +1,51 @@
-"""The comparisons under the protocol: what each learns from, that it runs, and that it is healthy on its own."""
+"""The baselines under the protocol: what each learns from, that it runs, and that it is healthy on its own."""
 
 import json
 import math
 
 import pytest
 import torch
-from helpers import Silent
-from hydra import compose, initialize_config_dir
-from hydra.errors import ConfigCompositionException
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.data import Bounded
 from torchrl.envs import ExplorationType, set_exploration_type
 
-import comparisons
-import evaluate
-import report
-from comparisons import AWAC, SACfD
+import ls3_envs
+from ls3_recipes.algorithms import ALGORITHMS
+from ls3_recipes.algorithms.awac import AWAC
+from ls3_recipes.algorithms.sacfd import SACfD
+from ls3_recipes.commands.evaluate import EvaluateSettings, evaluate
+from ls3_recipes.commands.report import ReportSettings, report
+from ls3_recipes.configuration import compose_settings, train_settings
+from ls3_recipes.protocol import run_experiment
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
-from settings import check_comparison
 
 # TorchRL warns about classes of its own while its collectors are imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Creating .* which inherits from WeightUpdaterBase:DeprecationWarning")
 
-ALGORITHMS = {
-    "bc": ("bc", []),
-    "sacfd": ("sacfd", []),
-    "sacfd_rrl": ("sacfd", ["recovery=true"]),
-    "awac": ("awac", []),
+BASELINES = {
+    "bc": ["algorithm=bc"],
+    "sacfd": ["algorithm=sacfd"],
+    "sacfd_rrl": ["algorithm=sacfd", "recovery=true"],
+    "awac": ["algorithm=awac"],
 }
-TASKS = ("navigation", "reacher", "pushing", "cable_routing")
 
 
-@pytest.fixture
-def configure(request):
-    conf = str(request.config.rootpath / "recipes" / "conf")
-
-    def make(algorithm, *overrides):
-        name, more = ALGORITHMS.get(algorithm, (algorithm, []))
-        with initialize_config_dir(conf, version_base="1.3"):
-            return compose(name, ["preset=smoke", "device=cpu", *more, *overrides])
-
-    return make
-
-
-# --- settings -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("task", "penalty", "gamma", "threshold"),
-    [
-        ("navigation", -3, 0.95, 0.8),
-        ("reacher", -1, 0.55, 0.7),
-        ("pushing", -3, 0.75, 0.7),
-        ("cable_routing", -3, 0.55, 0.7),
-    ],
-)
-def test_the_supplements_settings_per_task(configure, task, penalty, gamma, threshold):
-    config = configure("sacfd_rrl", f"task={task}")
-    assert config.policy.penalty == penalty
-    assert (config.policy.risk.gamma, config.policy.risk.threshold) == (gamma, threshold)
-    assert config.policy.lr == 3e-4
-    assert configure("awac", f"task={task}").policy.penalty == -1
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "override"),
-    [
-        ("bc", "encoder=resnet"),
-        ("bc", "policy.lr=0"),
-        ("bc", "vae.agent=/nowhere.pt"),
-        ("sacfd", "policy.penalty=3"),
-        ("sacfd", "policy.alpha=0"),
-        ("sacfd", "policy.risk.threshold=1.5"),
-        ("sacfd", "recovery=7"),
-        ("awac", "policy.temperature=0"),
-        ("awac", "policy.updates_per_step=-1"),
-        ("awac", "online.select=first"),
-    ],
-)
-def test_impossible_settings_are_refused(configure, algorithm, override):
-    check_comparison(configure(algorithm))
-    with pytest.raises(ValueError, match=override.split("=")[0].replace(".", r"\.")):
-        check_comparison(configure(algorithm, override))
-
-
-def test_behaviour_cloning_has_no_critic_to_set(configure):
-    with pytest.raises(ConfigCompositionException, match="penalty"):
-        configure("bc", "policy.penalty=-3")
-
-
-def test_a_run_keeps_the_settings_that_matter_to_it_alone(configure):
-    kept = comparisons.relevant(configure("sacfd"))
-    assert "planner" not in kept
-    assert "optim" not in kept
-    assert set(kept.online) == {"updates", "episodes_per_update", "select"}
-    assert OmegaConf.missing_keys(kept) == set()
+def configure(name, *overrides):
+    return train_settings("preset=smoke", "device=cpu", *BASELINES[name], *overrides)
 
 
 # --- everything once ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_every_comparison_runs_on_every_task(configure, tmp_path, algorithm, task):
+@pytest.mark.parametrize("task", ls3_envs.DOMAINS)
+@pytest.mark.parametrize("algorithm", BASELINES)
+def test_every_baseline_runs_on_every_task(tmp_path, algorithm, task):
     folder = tmp_path / "run"
     small = [f"task={task}", "vae.steps=2", "online.updates=1", "task.horizon=6", "task.offline_episodes=2"]
     config = configure(algorithm, *small, f"pictures={task == 'navigation'}", f"output={folder}")
-    summary = comparisons.train(config)
+    summary = run_experiment(config)
     assert summary == json.loads((folder / "summary.json").read_text())
     assert (summary["algorithm"], summary["task"]) == (algorithm, task)
     assert summary["online"]["episodes"] == 2
@@ -121,25 +57,30 @@ def test_every_comparison_runs_on_every_task(configure, tmp_path, algorithm, tas
 
 
 @pytest.mark.slow
-def test_ls3_and_a_comparison_go_through_evaluate_and_report(configure, run_folder, tmp_path):
+def test_ls3_and_a_baseline_go_through_evaluate_and_report(run_folder, tmp_path):
     folder = tmp_path / "awac"
-    comparisons.train(configure("awac", f"output={folder}", f"data={run_folder / 'demonstrations'}"))
-    conf = {"run": str(folder), "agent": "agent.pt", "episodes": 2, "seed": 5, "device": "cpu", "planner": {}}
-    summary = evaluate.evaluate(OmegaConf.create(conf | {"output": str(tmp_path / "evaluation")}))
+    run_experiment(configure("awac", f"output={folder}", f"data={run_folder / 'demonstrations'}"))
+    arguments = [f"run={folder}", "episodes=2", "seed=5", "device=cpu"]
+
+    def evaluated(*more):
+        return evaluate(compose_settings("evaluate", EvaluateSettings, [*arguments, *more]))
+
+    summary = evaluated(f"output={tmp_path / 'evaluation'}")
     assert summary["algorithm"] == "awac"
-    with pytest.raises(ValueError, match="has no planner"):
-        evaluate.evaluate(OmegaConf.create(conf | {"planner": {"horizon": 3}, "output": str(tmp_path / "other")}))
-    made = report.report(OmegaConf.create({"runs": [str(run_folder), str(folder)], "output": str(tmp_path / "report")}))
+    with pytest.raises(ValueError, match=r"is a run of awac, which has no planner: leave out planner\.horizon=3"):
+        evaluated("planner.horizon=3", f"output={tmp_path / 'other'}")
+    assert not (tmp_path / "other").exists()
+    made = report(ReportSettings(runs=(str(run_folder), str(folder)), output=str(tmp_path / "report")))
     assert [row["algorithm"] for row in made] == ["LS³", "AWAC"]
     assert (tmp_path / "report" / "comparison.png").is_file()
 
 
 @pytest.mark.slow
-def test_the_frozen_latents_are_those_of_ls3_with_the_same_seed(configure, run_folder, tmp_path):
+def test_the_frozen_latents_are_those_of_ls3_with_the_same_seed(run_folder, tmp_path):
     folder = tmp_path / "run"
     config = configure("bc", f"output={folder}", f"data={run_folder / 'demonstrations'}", "pictures=false")
     torch.manual_seed(0)
-    comparisons.train(config)
+    run_experiment(config)
     theirs = LS3Agent.load(run_folder / "agent.pt").encoder.state_dict()
     ours = torch.load(folder / "agent.pt", weights_only=True)["state_dict"]
     assert theirs
@@ -148,15 +89,15 @@ def test_the_frozen_latents_are_those_of_ls3_with_the_same_seed(configure, run_f
     # And they can be taken from a file instead.
     other = tmp_path / "other"
     taken = configure(
-        "bc", f"output={other}", f"data={run_folder / 'demonstrations'}", f"vae.agent={run_folder / 'agent.pt'}",
+        "bc", f"output={other}", f"data={run_folder / 'demonstrations'}", f"vae.checkpoint={run_folder / 'agent.pt'}",
         "pictures=false", "seed=7",
     )  # fmt: skip
-    comparisons.train(taken)
+    run_experiment(taken)
     again = torch.load(other / "agent.pt", weights_only=True)["state_dict"]
     assert all(torch.equal(again[f"encoder.{name}"], weights) for name, weights in theirs.items())
 
 
-def test_networks_of_another_algorithm_are_refused(configure, tmp_path):
+def test_networks_of_another_algorithm_are_refused(tmp_path):
     cloning = parts(configure("bc"))
     path = cloning.save(tmp_path / "bc.pt")
     other = parts(configure("awac"))
@@ -180,12 +121,11 @@ class Box:
     observation_spec = {"pixels": torch.zeros(3, 64, 64)}  # noqa: RUF012
 
 
-def parts(config, algorithm_class=None):
-    algorithm_class = algorithm_class or comparisons.COMPARISONS[config.algorithm]
-    return algorithm_class(comparisons.relevant(config), Box(), torch.device("cpu"))
+def parts(settings, box=None):
+    return ALGORITHMS[settings.algorithm](settings, box or Box(), torch.device("cpu"))
 
 
-def fill(algorithm, *tags):
+def fill(algorithm, logger, *tags):
     """A buffer with one episode of each tag, violating at step 4 and succeeding at step 6; ``loc`` tells the step."""
     buffer = algorithm.make_buffer(torch.device("cpu"))
     step = {"reward": -torch.ones(9, 1), "pixels": torch.zeros(9, 3, 64, 64, dtype=torch.uint8)}
@@ -198,12 +138,12 @@ def fill(algorithm, *tags):
         buffer.add(episode, tag)
     if algorithm.vae is not None:
         buffer.encode(algorithm.vae.encoder)
-    algorithm.begin(buffer, Silent(), 9)
+    algorithm.begin(buffer, logger, 9)
     return buffer
 
 
 @pytest.mark.parametrize("encoder", ["latents", "conv"])
-def test_each_learner_draws_from_the_data_that_the_paper_names(configure, encoder):
+def test_each_learner_draws_from_the_data_that_the_paper_names(recorder, encoder):
     everything = {0, 1, 2, 3}
     learners = {
         "bc": {"cloning": {0}},
@@ -213,7 +153,7 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(configure, encode
     }
     for name, expected in learners.items():
         algorithm = parts(configure(name, "policy.batch_size=200", f"encoder={encoder}"))
-        fill(algorithm, "success", "rand", "constraint", "online")
+        fill(algorithm, recorder, "success", "rand", "constraint", "online")
         for learner, tags in expected.items():
             rows = getattr(algorithm, learner).sample()
             assert set(rows["tag"].unique().tolist()) == tags, (name, learner)
@@ -222,9 +162,9 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(configure, encode
 
 
 @pytest.mark.parametrize("zero_at_goal", [True, False])
-def test_rewards_are_penalised_and_ends_are_as_set(configure, zero_at_goal):
+def test_rewards_are_penalised_and_ends_are_as_set(recorder, zero_at_goal):
     algorithm = parts(configure("awac", "policy.batch_size=300", f"policy.zero_at_goal={zero_at_goal}"))
-    fill(algorithm, "success")
+    fill(algorithm, recorder, "success")
     rows = algorithm.both.sample()
     violated = rows["next", "constraint"]
     assert violated.any()
@@ -235,21 +175,21 @@ def test_rewards_are_penalised_and_ends_are_as_set(configure, zero_at_goal):
     assert torch.equal(rows["next", "done"], expected)
 
 
-def test_the_task_learns_what_it_wanted_and_the_safety_critic_what_was_done(configure):
+def test_the_task_learns_what_it_wanted_and_the_safety_critic_what_was_done(recorder):
     algorithm = parts(configure("sacfd_rrl"))
-    fill(algorithm, "success", "constraint")
+    fill(algorithm, recorder, "success", "constraint")
     assert (algorithm.both.sample()["action"] == 1.0).all()
     assert (algorithm.risk.sample()["action"] == 0.0).all()
     offline = algorithm.offline_data({Tag.SUCCESS: TensorDict({"action": torch.randn(2, 3, 2)}, [2, 3])})
     assert torch.equal(offline[Tag.SUCCESS]["task_action"], offline[Tag.SUCCESS]["action"])
 
 
-def test_cloning_trains_the_actors_mean_and_leaves_its_spread(configure):
+def test_cloning_trains_the_actors_mean_and_leaves_its_spread(recorder):
     algorithm = parts(configure("sacfd", "policy.cloning_steps=150", "policy.hidden=[32]", "policy.lr=0.01"))
-    buffer = fill(algorithm, "success")
+    buffer = fill(algorithm, recorder, "success")
     wanted = torch.tensor([1.5, -2.0])
-    buffer.latents.storage[:].get("action").copy_(wanted.expand(9, 2))
-    seen = buffer.latents.storage[:].select("loc")
+    buffer.transitions.storage[:].get("action").copy_(wanted.expand(9, 2))
+    seen = buffer.transitions.storage[:].select("loc")
     before = algorithm.networks["actor"](seen.clone())["action_scale"].detach()
     algorithm.phases()["cloning"]()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -258,26 +198,24 @@ def test_cloning_trains_the_actors_mean_and_leaves_its_spread(configure):
     assert (after["action_scale"] / before - 1).abs().max() < 2.0  # only through the layers that both share
 
 
-def test_units_of_the_actions_change_no_value(configure):
+def test_units_of_the_actions_change_no_value(recorder):
     # The same box in metres and in centimetres: with the correction, entropy is worth the same in both.
     class Small(Box):
         action_spec = Bounded(low=-0.03, high=0.03, shape=(2,))
 
     rewards = []
     for box in (Box, Small):
-        algorithm = SACfD(comparisons.relevant(configure("sacfd")), box(), torch.device("cpu"))
-        fill(algorithm, "success")
+        algorithm = parts(configure("sacfd"), box())
+        fill(algorithm, recorder, "success")
         # r + γ (Q - α log π): log π is larger by the logarithm of the units.
         log_prob = -2 * math.log(box.action_spec.space.high[0].item())
         bonus = -0.99 * algorithm.options.alpha * log_prob
-        rewards.append(algorithm.rows([Tag.SUCCESS])()["next", "reward"].max().item() + bonus)
+        rewards.append(algorithm.sample([Tag.SUCCESS])["next", "reward"].max().item() + bonus)
     assert rewards[0] == pytest.approx(rewards[1], abs=1e-5)
     target = [-2.0 + 2 * math.log(h) for h in (3.0, 0.03)]
     for box, value in zip((Box, Small), target, strict=True):
-        algorithm = SACfD(
-            comparisons.relevant(configure("sacfd", "policy.learn_alpha=true")), box(), torch.device("cpu")
-        )
-        fill(algorithm, "success")
+        algorithm = parts(configure("sacfd", "policy.learn_alpha=true"), box())
+        fill(algorithm, recorder, "success")
         assert float(algorithm.both.loss.target_entropy) == pytest.approx(value, abs=1e-5)
 
 
@@ -309,18 +247,18 @@ class Walk:
         return float((~self.rows["next", "success"]).sum(1).float().mean())
 
 
-def walk_online(algorithm, teacher, rounds):
-    """Train on walks: offline on the teacher's, online on its own. Mean steps to the goal, of each round."""
-    data = {Tag.SUCCESS: Walk(20, teacher).rows.flatten()}
+def walk_online(algorithm, demonstrator, rounds, logger):
+    """Train on walks: offline on the demonstrator's, online on its own. Mean steps to the goal, of each round."""
+    data = {Tag.SUCCESS: Walk(20, demonstrator).rows.flatten()}
 
-    def sample(batch_size, *, tags, pixels=False):
+    def sample(batch_size, *, tags, observations=False):
         wanted = [data[tag] for tag in tags if tag in data]
         rows = torch.cat(wanted)
         return rows[torch.randint(len(rows), (batch_size,))].clone()
 
     buffer = TaggedReplayBuffer(10, latent_dim=2)
     buffer.sample = sample
-    algorithm.begin(buffer, Silent(), 40)
+    algorithm.begin(buffer, logger, 40)
     phases = algorithm.phases()
     phases.pop("vae")
     for train in phases.values():
@@ -339,12 +277,12 @@ def walk_online(algorithm, teacher, rounds):
     for _ in range(rounds):
         rows = Walk(4, act(True)).rows.flatten()
         data[Tag.ONLINE] = torch.cat([data[Tag.ONLINE], rows]) if Tag.ONLINE in data else rows
-        algorithm.train_online()
+        algorithm.update()
         lengths.append(Walk(20, act(False)).steps)
     return lengths
 
 
-def slow_teacher(td):
+def slow_demonstrator(td):
     return 1.0 + 0.6 * torch.randn(len(td), 2)  # 0.067 a step: about 30 steps, where 10 would do
 
 
@@ -354,14 +292,12 @@ def slow_teacher(td):
     # An advantage is a fraction of a step here, and there are hundreds of gradient steps, not thousands.
     [(SACfD, []), (AWAC, ["policy.temperature=0.1", "policy.tau=0.05"])],
 )
-def test_from_slow_demonstrations_to_a_quick_agent(configure, algorithm_class, own):
-    # No wall and λ = 0: what is left is to reach the goal, and sooner than the teacher.
+def test_from_slow_demonstrations_to_a_quick_agent(recorder, algorithm_class, own):
+    # No wall and λ = 0: what is left is to reach the goal, and sooner than the demonstrator.
     settings = ["policy.hidden=[64,64]", "policy.batch_size=128", "policy.cloning_steps=300", "policy.critic_steps=500"]
     more = ["policy.penalty=0", "policy.updates_per_step=1.5", "policy.lr=1e-3", "agent.latent_dim=2"]
-    algorithm = parts(
-        configure(algorithm_class.name, *settings, *more, *own, "online.episodes_per_update=4"), algorithm_class
-    )
-    lengths = walk_online(algorithm, slow_teacher, 8)
-    teacher = Walk(200, slow_teacher).steps
-    assert lengths[0] < 1.3 * teacher  # it imitates
-    assert lengths[-1] < 0.75 * teacher  # and improves
+    algorithm = parts(configure(algorithm_class.key, *settings, *more, *own, "online.episodes_per_update=4"))
+    lengths = walk_online(algorithm, slow_demonstrator, 8, recorder)
+    demonstrated = Walk(200, slow_demonstrator).steps
+    assert lengths[0] < 1.3 * demonstrated  # it imitates
+    assert lengths[-1] < 0.75 * demonstrated  # and improves
