@@ -62,19 +62,34 @@ def _union(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
 def prune(values: Mapping[str, Any], settings: type) -> dict[str, Any]:
     """Leave out what only other algorithms have: a preset and a task bring the settings of all of them.
 
-    What nobody has stays, and is refused when the settings are built.
+    What nobody has is refused: here, or when the settings are built.
+
+    Raises:
+        ValueError: for a setting that nobody has, in a section that only others have.
     """
     return _prune(values, defaults(settings), _known_anywhere())
 
 
-def _prune(values: Mapping[str, Any], own: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
+def _prune(
+    values: Mapping[str, Any], own: Mapping[str, Any], known: Mapping[str, Any], where: str = ""
+) -> dict[str, Any]:
     out = {}
     for key, value in values.items():
         if key not in own and key in known:
+            _refuse_unknown(value, known[key], where + key)
             continue
         nested = isinstance(value, Mapping) and isinstance(own.get(key), Mapping)
-        out[key] = _prune(value, own[key], known.get(key, {})) if nested else value
+        out[key] = _prune(value, own[key], known.get(key, {}), f"{where}{key}.") if nested else value
     return out
+
+
+def _refuse_unknown(value: Any, known: Any, where: str) -> None:
+    """Refuse what nobody has, in a section that is left out."""
+    if isinstance(value, Mapping) and isinstance(known, Mapping):
+        for key, inner in value.items():
+            if key not in known:
+                raise ValueError(f"{where} has no setting {key}. It has: {', '.join(known)}.")
+            _refuse_unknown(inner, known[key], f"{where}.{key}")
 
 
 def refuse_irrelevant(overrides: Iterable[str], settings: type, who: str) -> None:

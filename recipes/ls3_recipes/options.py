@@ -100,12 +100,13 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
         ValueError: flight has no setting sped. It has: speed.
     """
     nested = sections(settings)
-    names = [field.name for field in dataclasses.fields(settings)]
+    fields = dataclasses.fields(settings)  # type: ignore[arg-type]
+    names = [field.name for field in fields]
     for key in values:
         if key not in names:
             raise ValueError(f"{where or 'The run'} has no setting {key}. It has: {', '.join(names)}.")
     prefix = f"{where}." if where else ""
-    arguments = {}
+    arguments: dict[str, Any] = {}
     for key, value in values.items():
         if key in nested:
             arguments[key] = build(nested[key], value or {}, prefix + key)
@@ -113,7 +114,7 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
             arguments[key] = _tuples(value)
     required = {
         field.name
-        for field in dataclasses.fields(settings)
+        for field in fields
         if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
     }
     for key in sorted(required & nested.keys() - arguments.keys()):

@@ -10,7 +10,7 @@ from torchrl.data import Bounded
 
 import ls3_envs
 from ls3_recipes.algorithms import ALGORITHMS
-from ls3_recipes.configuration import CONF, choices_of, prune, settings_from, settings_of_run, train_settings
+from ls3_recipes.configuration import CONF, choices_of, settings_from, settings_of_run, train_settings
 from ls3_recipes.options import as_dict
 from ls3_torchrl import LS3Agent
 
@@ -211,17 +211,20 @@ def test_files_bring_the_settings_of_all_algorithms_and_each_is_left_its_own():
     assert "continue_failures" not in settings["buffer"]
 
 
-def test_a_file_with_a_setting_that_nobody_has_is_refused():
-    settings_class = ALGORITHMS["bc"].settings_class
-    values = as_dict(train_settings("algorithm=bc", "preset=smoke"))
-    for section, key, message in (("planner", "horizn", "planner"), ("agent", "layers", r"agent has no setting layers")):
-        config = OmegaConf.create(values)
-        OmegaConf.update(config, f"{section}.{key}", 3, force_add=True)
-        if section in values:
-            with pytest.raises(ValueError, match=message):
-                settings_from(config, settings_class)
-        else:  # of a section that is another algorithm's, all is left out
-            assert section not in prune(OmegaConf.to_container(config), settings_class)
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("agent.layers", r"^agent has no setting layers\. It has: latent_dim, "),
+        ("planner.horizn", r"^planner has no setting horizn\. It has: horizon, "),  # of a section that bc lacks
+        ("policy.risk.gama", r"^policy\.risk has no setting gama\. It has: gamma, threshold, offline_steps\."),
+        ("pictrues", r"^The run has no setting pictrues"),
+    ],
+)
+def test_a_file_with_a_setting_that_nobody_has_is_refused(setting, message):
+    config = OmegaConf.create(as_dict(train_settings("algorithm=bc", "preset=smoke")))
+    OmegaConf.update(config, setting, 3, force_add=True)
+    with pytest.raises(ValueError, match=message):
+        settings_from(config, ALGORITHMS["bc"].settings_class)
 
 
 @pytest.mark.parametrize(

@@ -81,6 +81,10 @@ def test_errors_name_setting_and_section(values, message):
 
 
 def test_only_messages_that_begin_with_a_setting_get_its_section():
-    for message, shown in (("size must", "box.size must"), ("sizes must", "sizes must"), ("x.size must", "x.size must")):
+    for message, shown in (
+        ("size must", "box.size must"),
+        ("sizes must", "sizes must"),
+        ("x.size must", "x.size must"),
+    ):
         with pytest.raises(ValueError, match=f"^{shown}"), errors_of("box", ["size"]):
             raise ValueError(message)

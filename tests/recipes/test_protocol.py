@@ -79,7 +79,11 @@ def test_data_of_another_task_are_refused_before_any_work(no_work, tmp_path):
     ("override", "error", "message"),
     [
         ("planner.num_elites=21", ValueError, r"^planner\.num_elites must lie between 1 and num_candidates = 20"),
-        ("planner.safe_set_threshold=1.2", ValueError, r"^planner\.safe_set_threshold must lie strictly between 0 and 1"),
+        (
+            "planner.safe_set_threshold=1.2",
+            ValueError,
+            r"^planner\.safe_set_threshold must lie strictly between 0 and 1",
+        ),
         ("planner.engine=jax", ValueError, "'auto', 'fused', 'rollout'"),
         ("agent.propagation=ts2", ValueError, "'ts1', 'tsinf'"),
         ("agent.action_scale=range", ValueError, "'box'"),

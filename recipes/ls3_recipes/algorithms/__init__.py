@@ -1,7 +1,7 @@
 """The algorithms that a run can train, all under one protocol: one row each."""
 
 from ls3_recipes.algorithms.awac import AWAC
-from ls3_recipes.algorithms.base import Algorithm, Label
+from ls3_recipes.algorithms.base import Algorithm
 from ls3_recipes.algorithms.bc import BehaviourCloning
 from ls3_recipes.algorithms.ls3 import LS3
 from ls3_recipes.algorithms.sacfd import SACfD
@@ -14,4 +14,4 @@ ALGORITHMS: dict[str, type[Algorithm]] = {
     "bc": BehaviourCloning,
 }
 
-__all__ = ["ALGORITHMS", "Algorithm", "Label"]
+__all__ = ["ALGORITHMS", "Algorithm"]

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from torchrl.record.loggers import Logger
 
 from ls3_recipes.algorithms.actor_critic import ActorCritic
-from ls3_recipes.algorithms.base import Label
 from ls3_recipes.algorithms.baseline import ActorCriticSettings, BaselineSettings
 from ls3_recipes.options import as_dict
+from ls3_recipes.plots.style import Label
 from ls3_recipes.run_settings import positive
 from ls3_torchrl.baselines import AWACLoss
 from ls3_torchrl.data import ALL_TAGS, TaggedReplayBuffer

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -14,16 +14,10 @@ from torchrl.envs import TransformedEnv
 from torchrl.record.loggers import Logger
 
 from ls3_recipes.options import as_dict, errors_of
+from ls3_recipes.plots.style import Label
 from ls3_recipes.run_settings import RunSettings
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
-
-
-class Label(NamedTuple):
-    """How reports show an algorithm: the name that people know it by, and the colour of its curves."""
-
-    title: str
-    colour: str
 
 
 class Algorithm(ABC):

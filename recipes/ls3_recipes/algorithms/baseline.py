@@ -122,6 +122,7 @@ class Baseline(Algorithm):
         with torch.random.fork_rng():  # leaves the VAE's training the random stream that LS³'s has
             self.networks = nn.ModuleDict(self.build(self._builder(env, device)))
         if self.vae is not None:
+            assert self.vae.decoder is not None
             self.networks.update({"encoder": self.vae.encoder, "decoder": self.vae.decoder})
         self.policy = self._seeing(self.act())
 

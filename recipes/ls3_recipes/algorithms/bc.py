@@ -7,8 +7,8 @@ from typing import Any
 
 from torch import nn
 
-from ls3_recipes.algorithms.base import Label
 from ls3_recipes.algorithms.baseline import Baseline, BaselineSettings
+from ls3_recipes.plots.style import Label
 from ls3_torchrl.baselines import deterministic_actor
 
 

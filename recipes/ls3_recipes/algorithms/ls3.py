@@ -11,9 +11,10 @@ from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 from torchrl.record.loggers import Logger
 
-from ls3_recipes.algorithms.base import Algorithm, Label, make_agent
+from ls3_recipes.algorithms.base import Algorithm, make_agent
 from ls3_recipes.options import as_dict, errors_of, from_signatures
 from ls3_recipes.plots.agent import plot_agent
+from ls3_recipes.plots.style import Label
 from ls3_recipes.run_settings import EpisodeSettings, RunSettings
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer

@@ -15,10 +15,10 @@ from torchrl.objectives import DDPGLoss, SACLoss
 from torchrl.record.loggers import Logger
 
 from ls3_recipes.algorithms.actor_critic import ActorCritic
-from ls3_recipes.algorithms.base import Label
 from ls3_recipes.algorithms.baseline import DEMONSTRATIONS, ActorCriticSettings, BaselineSettings
 from ls3_recipes.options import as_dict
 from ls3_recipes.plots.plane import Field
+from ls3_recipes.plots.style import Label
 from ls3_recipes.run_settings import at_least, positive
 from ls3_torchrl.baselines import RecoveryPolicy, SafetyCritic, SafetyCriticLoss, deterministic_actor
 from ls3_torchrl.data import ALL_TAGS, Tag, TaggedReplayBuffer

@@ -32,6 +32,8 @@ class ReferenceVAE(nn.Module):
                     return kind(layer.in_channels, layer.out_channels, kernel, stride)
             return layer
 
+        assert agent.encoder is not None
+        assert agent.decoder is not None
         posterior = next(m for m in agent.encoder.modules() if hasattr(m, "convolutions"))
         self.convolutions = nn.Sequential(*map(as_is, posterior.convolutions))
         self.head = nn.Linear(256, 2 * agent.encoder.latent_dim)

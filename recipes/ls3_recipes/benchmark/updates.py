@@ -102,6 +102,7 @@ def time_vae(
     agent = LS3Agent(action_spec=spec, in_channels=frames.shape[1], **as_dict(settings.agent)).to(device)
     slow = ReferenceVAE(agent).to(device)
     slow_optimizer = torch.optim.Adam(slow.parameters(), lr=1e-4)
+    assert agent.decoder is not None
     for half in (agent.encoder, agent.decoder):
         half.to(memory_format=torch.channels_last)
     loss = VAELoss(agent.encoder, agent.decoder)

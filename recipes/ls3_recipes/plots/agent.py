@@ -53,6 +53,7 @@ def plot_reconstructions(
     """Images above what the VAE makes of them, taken from all data."""
     frames = torch.cat([episodes["pixels"][:, ::7].flatten(0, 1) for episodes in offline.values()])
     frames = frames[torch.linspace(0, len(frames) - 1, columns).long()]
+    assert agent.decoder is not None
     td = agent.decoder(agent.encoder(TensorDict({"pixels": frames.to(_device(agent))}, [columns])))
     made = (td["reco_pixels"].clamp(0, 1) * 255).round().to(torch.uint8).cpu()
     with picture(folder / "reconstructions.png", 2, columns, (columns, 2.2)) as (figure, axes):

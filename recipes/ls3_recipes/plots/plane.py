@@ -34,11 +34,10 @@ def plot_outlines(axis: Axes, plane: Plane) -> None:
     """Walls, goals and frame of a plane."""
     for shape in plane.outlines:
         if isinstance(shape, Circle):
-            patch = plt.Circle(shape.centre, shape.radius, fc="none", ec=INK, lw=1.2)
+            axis.add_patch(plt.Circle(shape.centre, shape.radius, fc="none", ec=INK, lw=1.2))
         else:
             width, height = (b - a for a, b in zip(shape.low, shape.high, strict=True))
-            patch = plt.Rectangle(shape.low, width, height, fc="none", ec=INK, lw=1.2)
-        axis.add_patch(patch)
+            axis.add_patch(plt.Rectangle(shape.low, width, height, fc="none", ec=INK, lw=1.2))
     axis.set(xlim=plane.extent[:2], ylim=plane.extent[2:], xticks=[], yticks=[], aspect="equal")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 
@@ -32,6 +32,13 @@ STYLE: Any = {
     "ytick.color": INK,
     "legend.frameon": False,
 }
+
+
+class Label(NamedTuple):
+    """How pictures of several runs show an algorithm: the name that people know it by, and the colour of its curves."""
+
+    title: str
+    colour: str
 
 
 @contextmanager

@@ -57,7 +57,7 @@ def test_every_algorithm_has_a_name_and_a_colour_for_reports():
 class Reader(torch.nn.Module):
     """Stands for an encoder whose means are the brightness of two pixels."""
 
-    in_keys, out_keys = ["pixels"], ["loc", "scale", "latent"]  # noqa: RUF012
+    in_keys, out_keys = ["pixels"], ["loc", "scale", "latent"]
 
     def forward(self, td):
         corner = td["pixels"][:, :2, 0, 0].float() / 10.0
