@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parents[2] / "recipes" / "ls3_recipes"
 
 # What each part may import of the package, besides itself.
 LOWEST = {"options", "renamed", "console", "device", "figures"}
-MAY_IMPORT = dict.fromkeys(LOWEST, set())
+MAY_IMPORT: dict[str, set[str]] = {part: set() for part in LOWEST}
 MAY_IMPORT["run_settings"] = {"options"}
 MAY_IMPORT["run_folder"] = set()
 MAY_IMPORT["rollout"] = {"console", "run_settings"}

@@ -8,10 +8,14 @@ from dataclasses import dataclass
 
 from rich.table import Table
 
+from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.configuration import register, run_command
 from ls3_recipes.console import console
 from ls3_recipes.plots.report import check_alike, plot_report, read_run, rows_of
 from ls3_recipes.run_folder import require_new
+
+#: How algorithms are shown, in the order of legend and table.
+LABELS = {name: label for algorithm in ALGORITHMS.values() for name, label in algorithm.labels.items()}
 
 HELP = """
 Compare finished runs: success, violations and return against online episodes, mean and standard error over seeds.
@@ -57,9 +61,9 @@ def report(settings: ReportSettings) -> list[dict[str, str]]:
         raise ValueError("No runs: pass runs=[DIR,DIR,...], folders of finished runs.")
     runs = [read_run(path) for path in settings.runs]
     check_alike(runs)
-    rows = rows_of(runs)
+    rows = rows_of(runs, LABELS)
     folder.mkdir(parents=True)
-    plot_report(runs, folder / "comparison.png")
+    plot_report(runs, LABELS, folder / "comparison.png")
     lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
     lines += ["| " + " | ".join(row.values()) + " |" for row in rows]
     (folder / "comparison.md").write_text("\n".join(lines) + "\n")

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from ls3_recipes.algorithms import ALGORITHMS, Label
-from ls3_recipes.plots.style import INK, grid, picture
+from ls3_recipes.plots.style import INK, Label, grid, picture
 from ls3_recipes.run_folder import read_metrics
 
-#: Algorithms in the order of legend and table.
-LABELS = {name: label for algorithm in ALGORITHMS.values() for name, label in algorithm.labels.items()}
+#: How algorithms are shown, in the order of legend and table.
+Labels = Mapping[str, Label]
 #: Figures of an episode: name in the metrics, name in the summary, heading.
 FIGURES = (
     ("mean_success", "success_rate", "success"),
@@ -87,24 +86,24 @@ def mean_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return values.mean(0), error
 
 
-def grouped(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Runs by algorithm, in the order of :data:`LABELS`."""
+def grouped(runs: Sequence[Run], labels: Labels) -> dict[str, list[Run]]:
+    """Runs by algorithm, in the order of their labels."""
     groups = defaultdict(list)
     for run in sorted(runs, key=lambda run: run.seed):
         groups[run.algorithm].append(run)
-    return {name: groups[name] for name in sorted(groups, key=lambda n: [*LABELS, n].index(n))}
+    return {name: groups[name] for name in sorted(groups, key=lambda n: [*labels, n].index(n))}
 
 
-def label_of(name: str) -> Label:
+def label_of(name: str, labels: Labels) -> Label:
     """How an algorithm is shown; one that is not known is shown by its name."""
-    return LABELS.get(name, Label(name, INK))
+    return labels.get(name, Label(name, INK))
 
 
-def rows_of(runs: Sequence[Run]) -> list[dict[str, str]]:
+def rows_of(runs: Sequence[Run], labels: Labels) -> list[dict[str, str]]:
     """One row of the table for each algorithm: means over seeds ± their standard errors."""
     rows = []
-    for name, group in grouped(runs).items():
-        row = {"algorithm": label_of(name).title, "seeds": str(len(group))}
+    for name, group in grouped(runs, labels).items():
+        row = {"algorithm": label_of(name, labels).title, "seeds": str(len(group))}
         for part in ("online", "evaluation"):
             for _, figure, heading in FIGURES:
                 values = [run.summary[part][figure] for run in group if part in run.summary]
@@ -120,12 +119,12 @@ def rows_of(runs: Sequence[Run]) -> list[dict[str, str]]:
     return rows
 
 
-def plot_report(runs: Sequence[Run], path: Path) -> None:
+def plot_report(runs: Sequence[Run], labels: Labels, path: Path) -> None:
     """The figures against online episodes: means over seeds, with bands of one standard error."""
     demonstrated = np.mean([run.summary["demonstrations"]["return_mean"] for run in runs])
     with picture(path, 1, 4, (15, 3.3)) as (figure, (axes,)):
-        for name, group in grouped(runs).items():
-            episodes, label = group[0].episodes, label_of(name)
+        for name, group in grouped(runs, labels).items():
+            episodes, label = group[0].episodes, label_of(name, labels)
             panels = [np.stack([run.curves[key] for run in group]) for key, _, _ in FIGURES]
             violating = np.cumsum(panels[1] * np.diff(episodes, prepend=0), axis=1)
             for axis, values in zip(axes, [*panels, violating], strict=True):

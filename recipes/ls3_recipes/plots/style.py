@@ -14,7 +14,6 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from torch import Tensor
 
 INK, SAFE, UNSAFE, PALE, GOAL = "#22303c", "#1b7f79", "#d1495b", "#b8c4cc", "#e0a458"
@@ -64,20 +63,3 @@ def line(track: Tensor) -> np.ndarray:
 def image(pixels: Tensor) -> np.ndarray:
     """The newest picture of an observation ``[C, S, S]``, as matplotlib shows it."""
     return pixels[-3:].permute(1, 2, 0).cpu().numpy()
-
-
-__all__ = [
-    "GOAL",
-    "INK",
-    "PALE",
-    "SAFE",
-    "STYLE",
-    "UNSAFE",
-    "Axes",
-    "Figure",
-    "grid",
-    "image",
-    "line",
-    "picture",
-    "plt",
-]
