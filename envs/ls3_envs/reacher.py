@@ -41,7 +41,6 @@ def reacher_model() -> mujoco.MjModel:
   </option>
   <visual>
     <headlight ambient=".5 .5 .5" diffuse=".5 .5 .5" specular="0 0 0"/>
-    <map znear=".01"/>
     <quality shadowsize="2048"/>
   </visual>
   <default>
