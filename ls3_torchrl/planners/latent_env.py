@@ -120,13 +120,13 @@ class LatentEnv(ModelBasedEnvBase):
         if tensordict is None:
             tensordict = TensorDict({}, self.batch_size, device=self.device)
         latent = tensordict.get(self.latent_key, None)
-        begins = tensordict.get("_reset", None)
         if latent is None:
             self._require_nothing_else(tensordict)
-        if latent is None or begins is not None:
+        if (
+            latent is None or tensordict.get("_reset", None) is not None
+        ):  # rows that need not begin anew stay as they are
             shape = (*tensordict.batch_size, self.latent_dim)
-            prior = torch.randn(shape, device=self.device, dtype=self.latent_dtype)
-            latent = prior if latent is None else torch.where(begins, prior, latent)
+            latent = torch.randn(shape, device=self.device, dtype=self.latent_dtype)
         out = self._observe(latent.to(self.latent_dtype), tensordict.batch_size)
         if self.fixed_members:
             key = self.dynamics.member_key

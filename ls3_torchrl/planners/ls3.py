@@ -104,8 +104,9 @@ class LS3Planner(MPCPlannerBase):
         From the call: the tensordict with ``action``, and under ``plan`` ``feasible``, ``fallback``, ``relaxed``,
         ``safe_set_threshold`` (the δ_S acted on), ``score``, ``iterations``, all ``[*B, 1]``; under
         ``("next", "plan")`` the warm start ``mean`` and ``std`` ``[*B, H, A]``. ``out_keys`` name all of these.
-        ``in_keys`` name what is read: the observation, and if the optimiser uses it, the warm start and ``is_init``;
-        a tensordict may lack those two.
+        ``in_keys`` name what is read: the observation, and if the optimiser uses it, the warm start and ``is_init``.
+        A tensordict may lack those two, but a ``TensorDictSequential`` that is ``partial_tolerant`` leaves the planner
+        out then, as it does every module that lacks an input.
 
     Raises:
         ValueError: for settings out of range; by the call, for an observation that is not finite.
@@ -155,6 +156,7 @@ class LS3Planner(MPCPlannerBase):
         **optimizer_settings: Any,
     ) -> None:
         super().__init__(model, action_key=action_key)
+        self.action_spec = model.full_action_spec[model.action_key]  # also where the model has it under another name
         self.optimizer = _optimizer(optimizer, optimizer_settings)
         self.horizon = require_at_least(horizon, 1, "horizon")
         self.num_particles = require_at_least(num_particles, 1, "num_particles")

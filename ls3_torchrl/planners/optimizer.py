@@ -12,9 +12,9 @@ class PlanScores(NamedTuple):
     """How b × N action sequences are rated, each field ``[b, N]``.
 
     Attributes:
-        score: the objective; NaN ranks last.
+        score: the objective, higher is better; NaN ranks last, and may stand for any sequence that is not feasible.
         feasible: bool, whether the sequence may be carried out.
-        fallback: ranking for rows in which nothing is feasible.
+        fallback: ranking, higher is better, for rows in which nothing is feasible.
     """
 
     score: Tensor

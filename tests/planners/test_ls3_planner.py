@@ -1,84 +1,13 @@
 import pytest
 import torch
+from stub_planners import SMALL, A, D, classifier, latents, random_planner, still, stub_planner
 from tensordict import TensorDict
-from tensordict.nn import InteractionType, set_interaction_type
+from tensordict.nn import InteractionType, TensorDictModule, set_interaction_type
 from torch import nn
-from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, InitTracker, TransformedEnv
+from torchrl.data import Bounded
 
-from ls3_torchrl.modules import (
-    ConstraintEstimator,
-    EnsembleDynamics,
-    GoalEstimator,
-    PixelEncoder,
-    SafeSet,
-    ValueEnsemble,
-)
-from ls3_torchrl.planners import (
-    FusedImagination,
-    LatentEnv,
-    LS3Planner,
-    PlanNoise,
-    RolloutImagination,
-    describe_plan,
-)
-
-D, A = 4, 2
-SMALL = {"horizon": 3, "num_candidates": 24, "num_elites": 4, "num_particles": 3, "optim_steps": 2, "precision": "fp32"}
-
-
-def classifier(kind, *, prob=None, slope=0.0, offset=0.0, axis=0):
-    """A classifier of one probability everywhere, or of logit slope * (z_axis - offset)."""
-    module = kind(D, hidden=())
-    with torch.no_grad():
-        module.network[-1].weight.zero_()[0, axis] = slope
-        module.network[-1].bias.fill_(-slope * offset if prob is None else float(torch.tensor(prob).logit()))
-    return module
-
-
-def never(kind):
-    return classifier(kind, prob=0.001)
-
-
-def stub_planner(
-    *, spec=None, value=(1.0, 0.0, 0.0, 0.0), constraint=None, goal=None, safe_set=None, encoder=None, **options
-):
-    """A planner in a world where z' = z + (a_0, a_1, 0, 0) almost exactly and V = value · z."""
-    dynamics = EnsembleDynamics(D, A, num_members=2, hidden=(), log_scale_bounds=(-20.0, 4.0))
-    values = ValueEnsemble(D, num_members=2, hidden=())
-    with torch.no_grad():
-        dynamics.network.weights[0].zero_()[:, D : D + A, :A] = torch.eye(A)
-        dynamics.network.biases[0].zero_()[..., D:] = -20.0
-        values.network.weights[0].copy_(torch.as_tensor(value).expand(2, D).unsqueeze(-1))
-        values.network.biases[0].zero_()
-    env = LatentEnv(
-        dynamics,
-        constraint or never(ConstraintEstimator),
-        goal or never(GoalEstimator),
-        action_spec=Bounded(low=-1.0, high=1.0, shape=(A,)) if spec is None else spec,
-    )
-    return LS3Planner(env, values, safe_set or classifier(SafeSet, prob=0.99), encoder, **(SMALL | options))
-
-
-def random_planner(propagation="ts1", *, constraint_bias=0.0, **options):
-    """Random networks, so that nothing is symmetric; their probabilities spread round one half."""
-    torch.manual_seed(0)
-    env = LatentEnv(
-        EnsembleDynamics(D, A, num_members=3, hidden=(8,), propagation=propagation),
-        ConstraintEstimator(D, hidden=(8,)),
-        GoalEstimator(D, hidden=(8,)),
-        action_spec=Bounded(low=torch.tensor([-3.0, 0.5]), high=torch.tensor([-1.0, 2.0]), shape=(A,)),
-    )
-    with torch.no_grad():
-        env.constraint.network[-1].bias.add_(constraint_bias)
-        for head in (env.constraint, env.goal):
-            head.network[-1].weight.mul_(4)
-    safe_set = SafeSet(D, hidden=(8,))
-    return LS3Planner(env, ValueEnsemble(D, num_members=2, hidden=(8,)), safe_set, **(SMALL | options))
-
-
-def latents(*batch, seed=1):
-    return TensorDict({"latent": 2 * torch.randn(*batch, D, generator=torch.Generator().manual_seed(seed))}, batch)
+from ls3_torchrl.modules import ConstraintEstimator, GoalEstimator, PixelEncoder, SafeSet
+from ls3_torchrl.planners import FusedImagination, LatentEnv, LS3Planner, RolloutImagination
 
 
 def assert_in_box(action, spec):
@@ -247,17 +176,6 @@ def test_a_fallback_prefers_fewer_violations_to_a_safer_end():
     assert (path > 1.0).int().tolist() == [1, 0, 0]
 
 
-def test_describe_plan_by_hand():
-    plan = {
-        "fallback": torch.tensor([[[False], [True]], [[False], [False]]]),
-        "relaxed": torch.tensor([[[False], [True]], [[True], [False]]]),
-        "iterations": torch.tensor([[[4], [6]], [[5], [4]]]),
-    }
-    described = describe_plan(TensorDict({"me": {"plan": plan}}, [2, 2]), plan_key=("me", "plan"))
-    expected = {"fallback_rate": 0.25, "relaxed_rate": 0.5, "iterations": 4.75}
-    assert {name: round(value.item(), 6) for name, value in described.items()} == expected
-
-
 # --- engines, rows and repeatability --------------------------------------------------------------------------
 
 
@@ -331,7 +249,7 @@ def test_the_shapes_of_all_noise(common):
 def test_any_batch_shape_goes(engine, batch):
     out = random_planner(engine=engine)(latents(*batch))
     assert out["action"].shape == (*batch, A)
-    for name in ("feasible", "fallback", "safe_set_threshold", "score", "iterations"):
+    for name in ("feasible", "fallback", "relaxed", "safe_set_threshold", "score", "iterations"):
         assert out["plan", name].shape == (*batch, 1)
     for name in ("mean", "std"):
         assert out["next", "plan", name].shape == (*batch, 3, A)
@@ -346,11 +264,6 @@ def test_rows_of_a_two_dimensional_batch_keep_their_place():
 
 
 # --- the warm start -------------------------------------------------------------------------------------------
-
-
-def still(noise: PlanNoise) -> PlanNoise:
-    """Without candidate noise every candidate is its Gaussian's mean."""
-    return noise._replace(candidates=(torch.zeros_like(noise.candidates[0]), noise.candidates[1]))
 
 
 def test_a_row_that_was_reset_starts_afresh_while_others_stay_warm():
@@ -391,96 +304,6 @@ def test_a_start_without_spread_is_none():
     start = TensorDict({"latent": torch.zeros(1, D), "plan": {"mean": zeros, "std": zeros}}, [1])
     out = planner(start, noise=still(planner.sample_noise(1)))
     torch.testing.assert_close(out["action"], torch.tensor([[-2.0, 1.25]]))
-
-
-class Corridor(EnvBase):
-    """Row i's episodes last 3 + i steps; the latent is observed as it is."""
-
-    def __init__(self, rows=2):
-        super().__init__(batch_size=[rows])
-        self.observation_spec = Composite(latent=Unbounded(shape=(rows, D)), shape=(rows,))
-        self.action_spec = Bounded(low=-1.0, high=1.0, shape=(rows, A))
-        self.reward_spec = Unbounded(shape=(rows, 1))
-        self.clock = torch.zeros(rows, 1, dtype=torch.long)
-        self.where = torch.zeros(rows, D)
-
-    def _reset(self, tensordict=None, **kwargs):
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        mask = torch.ones_like(self.clock, dtype=torch.bool) if mask is None else mask
-        self.clock = torch.where(mask, 0, self.clock)
-        self.where = torch.where(mask, 0.0, self.where)
-        return TensorDict({"latent": self.where.clone()}, self.batch_size)
-
-    def _step(self, tensordict):
-        self.clock = self.clock + 1
-        self.where = torch.cat([self.where[:, :A] + tensordict["action"], self.where[:, A:]], -1)
-        done = self.clock >= 3 + torch.arange(len(self.clock)).unsqueeze(-1)
-        step = {"latent": self.where.clone(), "reward": self.where[:, :1], "done": done, "terminated": done}
-        return TensorDict(step, self.batch_size)
-
-    def _set_seed(self, seed):
-        """It draws nothing."""
-
-
-def corridor(planner, rows=2):
-    env = TransformedEnv(Corridor(rows), InitTracker())
-    env.append_transform(planner.make_tensordict_primer())
-    return env
-
-
-def assert_warm_starts_are_carried(path, plan_key=("plan",)):
-    """``path`` [rows, T]: each step begins with what the step before left, or with nothing after a reset."""
-    first = path["is_init"].squeeze(-1)
-    # Row 0 has episodes of 3 steps, row 1 of 4: resets happen in one row at a time.
-    assert first.int().tolist() == [[1, 0, 0] * 3, ([1, 0, 0, 0] * 3)[:9]]
-    for name in ("mean", "std"):
-        given, left = path[(*plan_key, name)], path[("next", *plan_key, name)]
-        assert (given[first] == 0).all()
-        later = ~first[:, 1:]
-        torch.testing.assert_close(given[:, 1:][later], left[:, :-1][later])
-        if name == "std":
-            assert (given[:, 1:][later] > 0).any(-1).any(-1).all()
-
-
-def test_rollout_carries_the_warm_start_and_drops_it_with_the_episode():
-    torch.manual_seed(0)
-    planner = stub_planner(p_random=0.5, min_std=0.05)
-    path = corridor(planner).rollout(9, planner, break_when_any_done=False)
-    assert_warm_starts_are_carried(path)
-    assert ("plan", "score") in path.keys(True)
-
-
-# TorchRL warns about classes of its own while this module is imported.
-@pytest.mark.filterwarnings("ignore:Creating .* which inherits from WeightUpdaterBase:DeprecationWarning")
-def test_collector_carries_the_warm_start_and_drops_it_with_the_episode():
-    from torchrl.collectors import Collector
-
-    torch.manual_seed(0)
-    planner = stub_planner(p_random=0.5, min_std=0.05)
-    collector = Collector(corridor(planner), planner, frames_per_batch=6, total_frames=18)
-    # Batches of three steps: episodes, and with them the plans, run on from one batch to the next.
-    path = torch.cat(list(collector), 1)
-    collector.shutdown()
-    assert_warm_starts_are_carried(path)
-
-
-def test_nested_keys_are_carried_too():
-    torch.manual_seed(0)
-    planner = stub_planner(p_random=0.5, min_std=0.05, plan_key=("ls3", "plan"))
-    path = corridor(planner).rollout(9, planner, break_when_any_done=False)
-    assert_warm_starts_are_carried(path, ("ls3", "plan"))
-
-
-def test_the_carried_start_is_what_the_next_plan_begins_with():
-    planner = stub_planner(p_random=0.0, min_std=0.05)
-    env = corridor(planner)
-    # Noise free: the first plan is the middle of the box, so make the second start elsewhere by hand.
-    noise = still(planner.sample_noise(2))
-    state = env.reset()
-    state = planner(state, noise=noise)
-    state["next", "plan", "mean"] = torch.full((2, 3, A), 0.25)
-    _, following = env.step_and_maybe_reset(state)
-    torch.testing.assert_close(planner(following, noise=noise)["action"], torch.full((2, A), 0.25))
 
 
 # --- keys -----------------------------------------------------------------------------------------------------
@@ -630,6 +453,12 @@ def test_statistics_judge_given_plans():
     torch.testing.assert_close(seen.safe_set_prob[0], torch.tensor([0.0, 3.0]).sigmoid(), atol=1e-4, rtol=0)
 
 
+@pytest.mark.parametrize("common", [True, False])
+def test_more_plans_than_candidates_can_be_imagined(common):
+    planner = random_planner(common_noise=common)
+    assert planner.imagine_plans(torch.zeros(1, D), torch.zeros(1, 30, 3, A)).safe_set_prob.shape == (1, 30)
+
+
 def test_planning_keeps_no_graph():
     out = random_planner()(latents(2))
     assert not any(value.requires_grad for value in out.values(True, True))
@@ -643,3 +472,134 @@ def test_noise_scale_multiplies_the_particles_noise_and_nothing_else():
     assert (drawn[0.0].noise == 0).all()
     torch.testing.assert_close(drawn[0.5].noise, 0.5 * drawn[1.0].noise)
     assert torch.equal(drawn[0.0].members, drawn[1.0].members)
+
+
+# --- encoders, dtypes and sizes -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("out_keys", "latent_key"),
+    [
+        (["embedding"], "embedding"),
+        (["loc", "scale"], "loc"),
+        ([("net", "latent"), "other"], ("net", "latent")),
+        (["loc", "latent"], "latent"),
+    ],
+)
+def test_an_encoder_names_its_latent_as_it_likes(out_keys, latent_key):
+    torch.manual_seed(0)
+    width = D * len(out_keys)
+    net = nn.Sequential(nn.Linear(10, width), nn.Unflatten(-1, (len(out_keys), D)))
+    encoder = TensorDictModule(lambda x: net(x).unbind(-2), ["sensors"], out_keys)
+    planner = stub_planner(encoder=encoder)
+    seen = TensorDict({"sensors": torch.randn(3, 10)}, [3])
+    torch.testing.assert_close(planner.encode(seen), encoder(seen.clone())[latent_key])
+    assert planner(seen)["action"].shape == (3, A)
+
+
+def test_an_encoder_whose_latent_cannot_be_guessed_is_refused():
+    encoder = TensorDictModule(lambda x: (x, x), ["sensors"], ["one", "other"])
+    with pytest.raises(ValueError, match=r"must write 'loc' .*'latent', or a single key.*'one', 'other'"):
+        stub_planner(encoder=encoder)
+
+
+@pytest.mark.parametrize("engine", ["fused", "rollout"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_action_specs_and_latents_of_other_dtypes(engine, dtype):
+    # In float32 the bound 0.2 lies above that of float64, and -0.3 below it: an action must not.
+    low, high = torch.tensor([0.1, -0.3], dtype=dtype), torch.tensor([0.2, 0.7], dtype=dtype)
+    spec = Bounded(low=low, high=high, shape=(A,), dtype=dtype)
+    for value, corner in (((1.0, 1.0, 0.0, 0.0), high), ((-1.0, -1.0, 0.0, 0.0), low)):
+        torch.manual_seed(0)
+        planner = stub_planner(spec=spec, value=value, engine=engine, num_candidates=300, optim_steps=6, p_random=0.3)
+        start = TensorDict({"latent": torch.zeros(3, D, dtype=dtype)}, [3])
+        start["plan"] = {"mean": corner.expand(3, 3, A), "std": torch.full((3, 3, A), 0.1, dtype=dtype)}
+        out = planner(start)
+        assert out["action"].dtype == dtype
+        assert spec.expand(3, A).is_in(out["action"])
+        assert (out["action"] == corner).any()
+        assert out["plan", "score"].dtype == torch.float32
+
+
+@pytest.mark.parametrize("engine", ["fused", "rollout"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_modules_of_other_dtypes_plan_the_same(engine, dtype):
+    plain, other = (random_planner(engine=engine, constraint_threshold=0.6) for _ in range(2))
+    other.to(dtype)
+    noise, start = plain.sample_noise(4), latents(4)
+    one, two = plain(start.clone(), noise=noise), other(start.clone(), noise=noise)
+    tolerance = 1e-4 if dtype == torch.float64 else 0.05
+    torch.testing.assert_close(one["action"], two["action"], atol=tolerance, rtol=0)
+    assert torch.equal(one["plan", "feasible"], two["plan", "feasible"])
+
+
+def test_an_action_spec_of_whole_numbers_is_refused():
+    with pytest.raises(ValueError, match=r"floating dtype, got torch.int64"):
+        stub_planner(spec=Bounded(low=-1, high=1, shape=(A,), dtype=torch.int64))
+
+
+@pytest.mark.parametrize("engine", ["fused", "rollout"])
+@pytest.mark.parametrize("batch", [[0], [2, 0]])
+def test_no_rows_give_no_plans_of_the_right_shapes(engine, batch):
+    given = (
+        (stub_planner(engine=engine), latents(*batch)),
+        (
+            stub_planner(engine=engine, encoder=PixelEncoder(latent_dim=D), p_random=0.5),
+            TensorDict(
+                {
+                    "pixels": torch.zeros(*batch, 3, 64, 64),
+                    "plan": {"mean": torch.zeros(*batch, 3, A), "std": torch.zeros(*batch, 3, A)},
+                    "is_init": torch.zeros(*batch, 1, dtype=torch.bool),
+                },
+                batch,
+            ),
+        ),
+    )
+    for planner, start in given:
+        out = planner(start)
+        assert out["action"].shape == (*batch, A)
+        assert out["plan", "score"].shape == out["plan", "relaxed"].shape == (*batch, 1)
+        assert out["next", "plan", "std"].shape == (*batch, 3, A)
+
+
+# --- modules from elsewhere -----------------------------------------------------------------------------------
+
+
+class Mover(nn.Module):
+    """z' = z + (a_0, a_1, 0, 0)."""
+
+    def forward(self, latent, action):
+        return latent + torch.cat([action, torch.zeros_like(latent[..., A:])], -1)
+
+
+def test_any_modules_can_be_planned_with():
+    torch.manual_seed(0)
+
+    def linear(weight, bias, out_key):
+        layer = nn.Linear(D, 1)
+        nn.init.zeros_(layer.weight)
+        layer.weight.data[0, 0], layer.bias.data[0] = weight, bias
+        return TensorDictModule(layer, [("my", "z")], [out_key])
+
+    model = LatentEnv(
+        TensorDictModule(Mover(), [("my", "z"), ("my", "u")], [("my", "following")]),
+        linear(50.0, -50.0, "unsafe"),  # begins at x = 1
+        linear(0.0, -9.0, "done_well"),
+        action_spec=Bounded(low=-1.0, high=1.0, shape=(A,)),
+        latent_dim=D,
+    )
+    # V = x writes [*B, 1], without members; the safe set is everywhere.
+    planner = LS3Planner(
+        model,
+        linear(1.0, 0.0, "worth"),
+        linear(0.0, 5.0, "safe"),
+        **(SMALL | {"num_candidates": 300, "num_elites": 10, "optim_steps": 6, "pessimism": 1.0}),
+    )
+    assert isinstance(planner.imagine, RolloutImagination)
+    result = planner.plan(torch.tensor([[0.5, 0.0, 0.0, 0.0]]))
+    path = 0.5 + result.actions[0, :, 0].cumsum(0)
+    assert path.max() <= 0.973
+    assert path.max() > 0.9
+    torch.testing.assert_close(result.score, path[-1:], atol=1e-4, rtol=0)
+    with pytest.raises(TypeError, match=r"model \(LatentEnv\)|dynamics \(TensorDictModule\) is no EnsembleDynamics"):
+        LS3Planner(model, planner.value, planner.safe_set, engine="fused")
