@@ -21,7 +21,7 @@ from ls3_torchrl.objectives.base import LatentLoss
 
 
 class SafetyCritic(TensorDictModuleBase):
-    """Q_risk(s, a), the discounted probability that a constraint will be violated: the largest of M networks' estimates.
+    """Q_risk(s, a), the discounted probability that a constraint will be violated: the highest of M networks.
 
     Args:
         action_spec: of one action ``[A]``, or batched; the networks see it in units of half its range.
@@ -90,8 +90,8 @@ class SafetyCriticLoss(LatentLoss):
     gradients that do not vanish where the critic is surely wrong.
 
     Args:
-        safety_critic: Q_risk, any module of an observation and last an action that writes logits ``[*B, M]``, by default
-            its first output, and the risk ``[*B, 1]``.
+        safety_critic: Q_risk, any module of an observation and last an action that writes logits ``[*B, M]`` (its first
+            output, unless ``set_keys`` says otherwise) and the risk ``[*B, 1]``.
         policy: π, any module of an observation that writes an action for it. It is not trained.
         gamma: γ_risk in [0, 1].
 
@@ -137,9 +137,6 @@ class SafetyCriticLoss(LatentLoss):
         risk_logit: NestedKey = "risk_logit"
         risk: NestedKey = "risk"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     _written = frozenset({"policy_action", "risk_logit", "risk"})
 
     safety_critic: TensorDictModuleBase
@@ -165,10 +162,13 @@ class SafetyCriticLoss(LatentLoss):
             risk=getattr(safety_critic, "risk_key", "risk"),
         )
 
-    def _risk(self, params: TensorDictParams, observation: Tensor, action: Tensor) -> TensorDictBase:
-        observation_key, action_key = self.safety_critic.in_keys[0], self.safety_critic.in_keys[-1]
-        rows = TensorDict({observation_key: observation, action_key: action}, batch_size=action.shape[:-1])
-        return call_with_params(self.safety_critic, params, rows)
+    def _risk(self, params: TensorDictParams, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits and risk of actions."""
+        keys, critic = (self.tensor_keys.risk_logit, self.tensor_keys.risk), self.safety_critic
+        rows = TensorDict({critic.in_keys[0]: observation, critic.in_keys[-1]: action}, batch_size=action.shape[:-1])
+        written = call_with_params(critic, params, rows)
+        require_keys(written, keys, "SafetyCriticLoss, of its critic,")
+        return written.get(keys[0]), written.get(keys[1])
 
     def target(self, tensordict: TensorDictBase) -> Tensor:
         """C + (1 − c) γ_risk Q'_risk(s', a'), ``[*B, 1]``."""
@@ -176,8 +176,9 @@ class SafetyCriticLoss(LatentLoss):
         constraint, after = tensordict.get(keys.constraint), tensordict.get(keys.next_observation)
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             rows = TensorDict({policy.in_keys[0]: after}, batch_size=constraint.shape[:-1])
-            action = policy(rows).get(keys.policy_action)
-            risk = self._risk(self.target_safety_critic_params, after, action).get(keys.risk)
+            rows = policy(rows)
+            require_keys(rows, [keys.policy_action], "SafetyCriticLoss, of its policy,")
+            risk = self._risk(self.target_safety_critic_params, after, rows.get(keys.policy_action))[1]
         violated = constraint.to(risk)
         return violated + (1.0 - violated) * self.gamma * risk
 
@@ -185,10 +186,10 @@ class SafetyCriticLoss(LatentLoss):
         """The loss on transitions ``[*B]``."""
         keys = self.tensor_keys
         target = self.target(tensordict)
-        written = self._risk(self.safety_critic_params, tensordict.get(keys.observation), tensordict.get(keys.action))
-        logits = written.get(keys.risk_logit)
+        observation, action = tensordict.get(keys.observation), tensordict.get(keys.action)
+        logits, risk = self._risk(self.safety_critic_params, observation, action)
         loss = binary_cross_entropy_with_logits(logits, target.expand_as(logits))
-        return {"loss_safety": loss, "risk": written.get(keys.risk).detach().mean()}
+        return {"loss_safety": loss, "risk": risk.detach().mean()}
 
 
 class RecoveryPolicy(TensorDictModuleBase):

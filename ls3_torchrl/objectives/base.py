@@ -1,10 +1,11 @@
-"""What the losses of latents share: which keys they read, calls by keyword, and targets for several members."""
+"""What the losses have in common: which keys they read, calls by keyword, and targets for several members."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -18,9 +19,9 @@ from ls3_torchrl._checks import require_keys
 class LatentLoss(LossModule):
     """Base class of a loss: a subclass declares its keys in ``_AcceptedKeys`` and computes :meth:`losses`.
 
-    ``in_keys`` are the accepted keys, as ``set_keys`` left them. A loss is called with a tensordict, or with the tensors
-    as keyword arguments, for which the parts of a nested key are joined by an underscore; then it returns the
-    ``out_keys`` as a tuple, or as a single tensor where ``select_out_keys`` left one.
+    ``in_keys`` are the accepted keys, as ``set_keys`` left them. A loss is called with a tensordict, or with tensors as
+    keyword arguments, named by their keys, with an underscore between the parts of a nested key. It then returns the
+    values of ``out_keys``, which ``select_out_keys`` can shorten, as a tuple; a single one as a tensor.
 
     Raises:
         KeyError: when a key is missing.
@@ -31,9 +32,6 @@ class LatentLoss(LossModule):
         ...     class _AcceptedKeys:
         ...         latent: NestedKey = "latent"
         ...         next_latent: NestedKey = ("next", "latent")
-        ...
-        ...     tensor_keys: _AcceptedKeys
-        ...     default_keys = _AcceptedKeys
         ...
         ...     def __init__(self) -> None:
         ...         super().__init__()
@@ -51,13 +49,16 @@ class LatentLoss(LossModule):
     class _AcceptedKeys:
         """Keys that ``set_keys`` can change."""
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
+    tensor_keys: Any
+    default_keys: Callable[..., Any] = _AcceptedKeys
     #: Accepted keys that a batch may lack.
-    _optional: ClassVar[frozenset[str]] = frozenset()
+    _optional: frozenset[str] = frozenset()
     #: Accepted keys that a module writes, which no batch needs to hold.
-    _written: ClassVar[frozenset[str]] = frozenset()
+    _written: frozenset[str] = frozenset()
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.default_keys = cls._AcceptedKeys
 
     def _start_from_keys(self, **defaults: NestedKey) -> None:
         """Take other default keys than the class has, such as those of the modules that the loss is made for."""
@@ -132,6 +133,6 @@ def require_ensemble(module: TensorDictModuleBase, who: str) -> None:
     """Raise ``TypeError`` unless ``module`` says how many members it has."""
     if not hasattr(module, "num_members"):
         raise TypeError(
-            f"{who}(bootstrap=True) needs an ensemble, with an attribute num_members and an argument per_member; "
-            f"{type(module).__name__} is none. Pass bootstrap=False, or an ensemble."
+            f"{who}(bootstrap=True) needs an ensemble, a module with an attribute num_members and an argument "
+            f"per_member; {type(module).__name__} is none. Pass bootstrap=False, or an ensemble."
         )

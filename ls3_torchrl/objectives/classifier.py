@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ls3_torchrl.modules.call import call_on_latent
-from ls3_torchrl.modules.classifiers import GoalEstimator, SafeSet
+from ls3_torchrl.modules.classifiers import LatentClassifier, SafeSet
 from ls3_torchrl.objectives.base import LatentLoss
 
 
@@ -53,9 +53,6 @@ class ClassifierLoss(LatentLoss):
         latent: NestedKey = ("next", "latent")
         label: NestedKey = ("next", "constraint")
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     classifier: TensorDictModuleBase
 
     def __init__(self, classifier: TensorDictModuleBase, *, name: str | None = None) -> None:
@@ -66,13 +63,14 @@ class ClassifierLoss(LatentLoss):
                 "Train it with SafeSetLoss."
             )
         self.classifier = classifier
-        self.name: str = name or getattr(classifier, "name", None) or "constraint"
+        own_name, label = None, None
+        if isinstance(classifier, LatentClassifier):
+            own_name, label = classifier.name, classifier.label_key
+        self.name: str = name or own_name or "constraint"
         self.out_keys = [f"loss_{self.name}", f"{self.name}_accuracy"]
-        self._start_from_keys(label=getattr(classifier, "label_key", None) or self._label_of(self.name))
-
-    @staticmethod
-    def _label_of(name: str) -> NestedKey:
-        return GoalEstimator.label_key if name == GoalEstimator.name else ("next", name)
+        if label is None:
+            label = ("next", "success" if self.name == "goal" else self.name)
+        self._start_from_keys(label=label)
 
     def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """Cross-entropy and accuracy on states ``[B]``."""

@@ -61,9 +61,6 @@ class EnsembleDynamicsLoss(LatentLoss):
         action: NestedKey = "action"
         next_latent: NestedKey = ("next", "latent")
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     dynamics: TensorDictModuleBase
 
     def __init__(self, dynamics: TensorDictModuleBase, *, bootstrap: bool = False, steps: int = 1) -> None:
@@ -72,9 +69,9 @@ class EnsembleDynamicsLoss(LatentLoss):
         self._predict = "distribution" if steps == 1 else "unroll"
         if not hasattr(dynamics, self._predict):
             raise TypeError(
-                f"EnsembleDynamicsLoss(steps={steps}) needs dynamics with a method {self._predict}(latent, action) that "
-                f"returns mean and standard deviation of the next latents; {type(dynamics).__name__} has none. Add it, "
-                "or learn with LatentPredictionLoss, which needs the next latents alone."
+                f"EnsembleDynamicsLoss(steps={steps}) needs dynamics with a method {self._predict}(latent, action) for "
+                f"mean and standard deviation of the next latents; {type(dynamics).__name__} has none. Add the method, "
+                "or train with LatentPredictionLoss, which only needs the next latent."
             )
         if bootstrap:
             require_ensemble(dynamics, "EnsembleDynamicsLoss")

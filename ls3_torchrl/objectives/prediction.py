@@ -64,9 +64,6 @@ class LatentPredictionLoss(LatentLoss):
         action: NestedKey = "action"
         next_pixels: NestedKey = ("next", "pixels")
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     encoder: TensorDictModuleBase
     dynamics: TensorDictModuleBase
 

@@ -63,9 +63,6 @@ class SafeSetLoss(LatentLoss):
         in_success: NestedKey = "in_success"
         weight: NestedKey = "safe_set_weight"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     _optional = frozenset({"weight"})
 
     safe_set: TensorDictModuleBase

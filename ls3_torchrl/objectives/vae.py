@@ -58,9 +58,6 @@ class VAELoss(LatentLoss):
         pixels: NestedKey = "pixels"
         target: NestedKey | None = None
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     encoder: TensorDictModuleBase
     decoder: TensorDictModuleBase
 
@@ -77,9 +74,9 @@ class VAELoss(LatentLoss):
             raise ValueError(f"beta must not be negative, got {beta}.")
         if posterior_keys(encoder)[1] is None:
             raise ValueError(
-                "VAELoss needs an encoder that writes mean and standard deviation of a posterior, as 'loc' and 'scale'; "
-                f"{type(encoder).__name__} writes {encoder.out_keys}. An encoder without a standard deviation needs no "
-                "VAELoss; LatentPredictionLoss can train it."
+                "VAELoss needs an encoder that writes mean and standard deviation of its posterior, as 'loc' and "
+                f"'scale'; {type(encoder).__name__} writes {encoder.out_keys}. Add a standard deviation, or train it "
+                "with LatentPredictionLoss, which needs none."
             )
         self.encoder, self.decoder = encoder, decoder
         self.out_keys = ["loss_vae", "reconstruction", "kl"]

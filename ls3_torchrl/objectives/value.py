@@ -54,9 +54,6 @@ class OfflineValueLoss(LatentLoss):
         latent: NestedKey = "latent"
         reward_to_go: NestedKey = "reward_to_go"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     value: TensorDictModuleBase
 
     def __init__(self, value: TensorDictModuleBase, *, bootstrap: bool = False) -> None:
@@ -133,9 +130,6 @@ class TD1ValueLoss(LatentLoss):
         next_latent: NestedKey = ("next", "latent")
         reward: NestedKey = ("next", "reward")
         reward_to_go: NestedKey = "reward_to_go"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
 
     value: TensorDictModuleBase
     value_params: TensorDictParams

@@ -86,7 +86,7 @@ def test_bytes_and_unit_floats_are_the_same_image():
         torch.testing.assert_close(from_bytes["loc"], from_floats["loc"], atol=1e-5, rtol=1e-4)
     # Black and white reach the network as 0 and 1.
     extremes = torch.tensor([0, 255], dtype=torch.uint8).view(2, 1, 1, 1).expand(2, 3, 64, 64)
-    scaled = as_unit_pixels(extremes, 3)
+    scaled = as_unit_pixels(extremes)
     assert (scaled[0] == 0).all()
     assert (scaled[1] == 1).all()
 
@@ -287,3 +287,25 @@ def test_the_decoder_compiles_as_one_graph_with_the_same_gradients():
     results = [torch.autograd.grad(f(latent), list(decoder.parameters())) for f in (error, compiled)]
     for ours, theirs in zip(*results, strict=True):
         torch.testing.assert_close(ours, theirs)
+
+
+@pytest.mark.parametrize("as_floats", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+def test_both_halves_compute_in_the_dtype_they_were_moved_to(dtype: torch.dtype, as_floats: bool):
+    encoder, decoder = PixelEncoder(latent_dim=4), PixelDecoder(latent_dim=4, background=True)
+    decoder.set_background(torch.rand(3, 64, 64))
+    pixels = some_pixels(2) / 255 if as_floats else some_pixels(2)
+    before = decoder(encoder(TensorDict({"pixels": pixels}, [2])))
+    after = decoder.to(dtype)(encoder.to(dtype)(TensorDict({"pixels": pixels}, [2])))
+    for key in ("loc", "scale", "latent", "reco_pixels"):
+        assert after[key].dtype == dtype
+        tolerance = 1e-5 if dtype == torch.float64 else 0.02
+        torch.testing.assert_close(after[key], before[key].to(dtype), atol=tolerance, rtol=tolerance)
+    after["reco_pixels"].sum().backward()
+    assert all(p.grad.dtype == dtype for p in [*encoder.parameters(), *decoder.parameters()])
+
+
+def test_bytes_are_scaled_in_double_precision_where_it_is_asked_for():
+    pixels = torch.tensor([[[[51]]]], dtype=torch.uint8)
+    assert as_unit_pixels(pixels, torch.float64).item() == 51 / 255
+    assert as_unit_pixels(pixels).dtype == torch.float32
