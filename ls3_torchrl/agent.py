@@ -27,7 +27,7 @@ from ls3_torchrl.modules import (
     SafeSet,
     ValueEnsemble,
 )
-from ls3_torchrl.planners import LatentEnv, LS3Planner, make_planner
+from ls3_torchrl.planners import LatentEnv, LS3Planner
 
 FORMAT = "ls3_torchrl.agent"
 VERSION = 2
@@ -230,7 +230,7 @@ class LS3Agent(nn.Module):
         self.planner_settings |= settings
         device = next(self.parameters()).device
         model = LatentEnv(self.dynamics, self.constraint, self.goal, action_spec=self.action_spec, device=device)
-        return make_planner(model, self.value, self.safe_set, self.encoder, **self.planner_settings)
+        return LS3Planner(model, self.value, self.safe_set, self.encoder, **self.planner_settings)
 
     def save(self, path: str | Path) -> Path:
         """Write weights and all that the agent was made for to one file; a half-written file never takes its place."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.record.loggers import Logger
 
-from ls3_torchrl.planners.layers import fastest_precision
+from ls3_torchrl.layers import fastest_precision
 from ls3_torchrl.trainers.options import Autocast
 from ls3_torchrl.trainers.progress import progress_bar
 

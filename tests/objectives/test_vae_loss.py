@@ -154,6 +154,12 @@ def test_bytes_and_floats_give_one_loss():
     assert loss(as_bytes)["reconstruction"].item() == pytest.approx((0.25 - 0.2) ** 2, rel=1e-5)
 
 
+def test_in_double_precision_the_images_are_scaled_in_it():
+    loss = constant_vae(0.25).double()
+    out = loss(TensorDict({"pixels": torch.full((2, 3, 64, 64), 51, dtype=torch.uint8)}, [2]))
+    assert out["reconstruction"].item() == pytest.approx((0.25 - 0.2) ** 2, rel=1e-12)
+
+
 def test_modules_with_keys_of_their_own_and_an_untouched_batch():
     encoder = PixelEncoder(
         latent_dim=2, pixels_key=("a", "x"), loc_key=("b", "m"), scale_key=("b", "s"), latent_key=("b", "z")
