@@ -50,6 +50,12 @@ def test_an_existing_output_folder_is_refused_before_any_work(no_work, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
+@pytest.fixture
+def no_probe(monkeypatch):
+    """Leaves out what takes most of a smoke run's time and changes nothing that is learnt."""
+    monkeypatch.setattr(ls3, "probe", lambda *_: {})
+
+
 def tiny_episodes(folder, tags, task="navigation"):
     pixels = torch.zeros(1, 2, 3, 64, 64, dtype=torch.uint8)
     flags = {key: torch.zeros(1, 2, 1, dtype=torch.bool) for key in ("constraint", "success")}
@@ -174,7 +180,7 @@ def test_the_smoke_preset_runs_everything_and_leaves_a_complete_folder(tmp_path)
 
 
 @pytest.mark.slow
-def test_the_seed_decides_a_run(tmp_path):
+def test_the_seed_decides_a_run(no_probe, tmp_path):
     def run(name, seed):
         output = f"output={tmp_path / name}"
         summary = run_experiment(settings("pictures=false", "online.updates=1", f"seed={seed}", output))
@@ -188,7 +194,7 @@ def test_the_seed_decides_a_run(tmp_path):
 
 
 @pytest.mark.parametrize("select", ["last", "best"])
-def test_the_agent_that_is_kept_is_the_one_that_was_selected(monkeypatch, tmp_path, select):
+def test_the_agent_that_is_kept_is_the_one_that_was_selected(no_probe, monkeypatch, tmp_path, select):
     monkeypatch.setattr(protocol, "best_update", lambda online: 1)
     run_experiment(settings(f"online.select={select}", "pictures=false", f"output={tmp_path / 'run'}"))
     kept = LS3Agent.load(tmp_path / "run" / "agent.pt").state_dict()
@@ -197,14 +203,14 @@ def test_the_agent_that_is_kept_is_the_one_that_was_selected(monkeypatch, tmp_pa
     assert same == ([False, True, False] if select == "best" else [False, False, True])
 
 
-def test_without_updates_there_are_no_online_episodes_and_nothing_is_selected(tmp_path):
+def test_without_updates_there_are_no_online_episodes_and_nothing_is_selected(no_probe, tmp_path):
     run = settings("online.updates=0", "online.select=best", "pictures=false", f"output={tmp_path / 'run'}")
     summary = run_experiment(run)
     assert "online" not in summary
     assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["agent_000.pt"]
 
 
-def test_a_run_whose_data_were_there_already_learns_the_same(run_folder, tmp_path):
+def test_a_run_whose_data_were_there_already_learns_the_same(no_probe, run_folder, tmp_path):
     folder = tmp_path / "run"
     torch.manual_seed(0)
     run_experiment(settings(f"data={run_folder / 'demonstrations'}", "pictures=false", f"output={folder}"))

@@ -62,7 +62,6 @@ class Algorithm(ABC):
         options = as_dict(settings.buffer)
         with errors_of("buffer", options):
             return TaggedReplayBuffer(
-                options.pop("capacity"),
                 **options,
                 **labels,
                 latent_dim=as_dict(settings.agent)["latent_dim"],
