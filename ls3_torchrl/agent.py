@@ -138,6 +138,15 @@ class LS3Agent(nn.Module):
         50
     """
 
+    # Any module that reads and writes what the agent's own does.
+    encoder: Any
+    decoder: Any
+    dynamics: Any
+    value: Any
+    safe_set: Any
+    constraint: Any
+    goal: Any
+
     def __init__(
         self,
         action_dim: int | None = None,

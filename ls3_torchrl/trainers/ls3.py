@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.record.loggers import Logger
 
 from ls3_torchrl.agent import LS3Agent
@@ -100,11 +101,14 @@ class LS3Trainer:
         """The learners by name, in the order in which they are trained."""
         return {name: getattr(self, name) for name in LEARNERS}
 
+    def _members(self, module: TensorDictModuleBase) -> int | None:
+        """Members of an ensemble that each learn from a batch of their own; ``None`` where all learn from the same."""
+        return getattr(module, "num_members", None) if self.options.optim.bootstrap else None
+
     def _sampler(self, tags: tuple = ALL_TAGS, members: int | None = None, **rows: Any) -> Callable[[], TensorDictBase]:
-        optim = self.options.optim
-        members = members if optim.bootstrap else None
+        batch_size = self.options.optim.batch_size
         rows |= {"tags": tags, "online_fraction": self.options.online.fraction}
-        return lambda: self.buffer.sample(optim.batch_size, members=members, **rows)
+        return lambda: self.buffer.sample(batch_size, members=members, **rows)
 
     def _dynamics_learner(self) -> Learner:
         """Equation (2)."""
@@ -114,36 +118,39 @@ class LS3Trainer:
             "without": None if self.buffer.dynamics_after_violation else "after_violation",
             "steps": horizon if horizon > 1 else None,
         }
-        loss = EnsembleDynamicsLoss(dynamics, bootstrap=options.optim.bootstrap, steps=horizon)
+        members = self._members(dynamics)
+        loss = EnsembleDynamicsLoss(dynamics, bootstrap=members is not None, steps=horizon)
         loss.set_keys(action=self.buffer.keys.action)
-        sample = self._sampler(members=dynamics.num_members, **rows)
+        sample = self._sampler(members=members, **rows)
         return Learner("dynamics", loss, sample, lr=options.optim.dynamics_lr, **self._how)
 
     def _value_learner(self) -> Learner:
         """Equation (3), with the value of failure beside it where it is asked for."""
         options, value = self.options, self.agent.value
-        bootstrap = options.optim.bootstrap
+        members = self._members(value)
+        bootstrap = members is not None
         auxiliary = None
         if options.loss.failure_weight > 0.0:
             auxiliary = AuxiliaryLoss(
                 options.loss.failure_weight, OfflineValueLoss(value, bootstrap=bootstrap), self._sample_failures
             )
         loss = OfflineValueLoss(value, bootstrap=bootstrap)
-        sample = self._sampler(VALUE_TAGS, value.num_members)
+        sample = self._sampler(VALUE_TAGS, members)
         return Learner("value", loss, sample, lr=options.optim.lr, auxiliary=auxiliary, **self._how)
 
     def _value_td_learner(self) -> Learner:
         """Equation (4)."""
         options, value = self.options, self.agent.value
+        members = self._members(value)
         loss = TD1ValueLoss(
             value,
             gamma=self.buffer.gamma,
             zero_at_goal=options.loss.zero_at_goal,
             monte_carlo=options.loss.monte_carlo,
-            bootstrap=options.optim.bootstrap,
+            bootstrap=members is not None,
         )
         loss.set_keys(reward=self.buffer.keys.reward)
-        sample = self._sampler(VALUE_TAGS, value.num_members)
+        sample = self._sampler(VALUE_TAGS, members)
         interval = options.optim.target_interval
         return Learner("value", loss, sample, lr=options.optim.lr, target_interval=interval, **self._how)
 
@@ -162,7 +169,7 @@ class LS3Trainer:
 
     def _classifier_learner(self, name: str, label: NestedKey) -> Learner:
         loss = ClassifierLoss(getattr(self.agent, name), name=name)
-        loss.set_keys(label=label)
+        loss.set_keys(label=label)  # under the buffer's keys, which need not be the classifier's
         return Learner(name, loss, self._sampler(), lr=self.options.optim.lr, **self._how)
 
     def _failure_value(self) -> float:
@@ -176,8 +183,8 @@ class LS3Trainer:
     def _sample_failures(self) -> TensorDictBase:
         """States of the violating demonstrations, labelled with the value of failure."""
         optim = self.options.optim
-        members = self.agent.value.num_members if optim.bootstrap else 1
-        count = max(optim.batch_size // 4, 1) * members
+        members = self._members(self.agent.value)
+        count = max(optim.batch_size // 4, 1) * (members or 1)
         rows = self.buffer.sample(count, tags=[Tag.CONSTRAINT])
         if self.options.loss.failure_rows == "violating":
             found = rows[self.buffer.keys.constraint].flatten().nonzero().flatten()
@@ -185,7 +192,7 @@ class LS3Trainer:
                 # Those that were found stand in for the others: the batch keeps its size.
                 rows = rows[found[torch.arange(count, device=found.device) % len(found)]]
                 rows.set("latent", rows["next", "latent"])
-        rows = rows.reshape(-1, members) if optim.bootstrap else rows
+        rows = rows if members is None else rows.reshape(-1, members)
         return rows.set("reward_to_go", torch.full_like(rows["reward_to_go"], self._failure_value()))
 
     def _weigh(self, rows: TensorDictBase) -> TensorDictBase:

@@ -43,7 +43,7 @@ class VAEOptions:
         steps: gradient steps, at least 1.
         batch_size: images in a step, at least 1.
         lr: Adam's learning rate, above 0; the peak of a one-cycle schedule.
-        schedule: of the learning rate, ``"constant"`` or ``"onecycle"`` (warm-up over a tenth of the steps, then cosine).
+        schedule: of the learning rate, ``"constant"`` or ``"onecycle"``: it rises for a tenth of the steps, then falls.
         beta: β, at least 0 (Table 1: 1e-6).
         warmup: fractions [start, end] of the steps between which β and ``prediction_weight`` rise from 0; ``None``
             for none. With few latents and a large β a small moving object is otherwise never drawn.

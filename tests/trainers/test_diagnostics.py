@@ -78,9 +78,9 @@ def test_episodes_shorter_than_what_is_imagined_are_refused():
 
 
 def test_a_probe_leaves_the_random_stream_of_training_alone():
-    episodes = walks(3)
+    agent, episodes = agent_with(), walks(3)
     torch.manual_seed(4)
     expected = torch.rand(3)
     torch.manual_seed(4)
-    StateProbe(agent_with(), [episodes], steps=5, progress=False)
+    StateProbe(agent, [episodes], steps=5, progress=False)
     assert torch.equal(torch.rand(3), expected)

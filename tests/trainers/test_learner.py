@@ -72,7 +72,7 @@ def test_a_loss_that_is_not_finite_stops_the_phase_with_a_remedy():
     value = ValueEnsemble(4, num_members=2, hidden=(8,))
     bad = TensorDict({"latent": torch.randn(8, 4), "reward_to_go": torch.full((8, 1), torch.nan)}, [8])
     learner = Learner("value", OfflineValueLoss(value), lambda: bad, lr=1e-3, progress=False)
-    with pytest.raises(FloatingPointError, match="Value diverged.*learning rate"):
+    with pytest.raises(FloatingPointError, match=r"Value diverged.*learning rate"):
         learner.train(3, "Value")
 
 
@@ -206,7 +206,14 @@ def test_any_logger_of_torchrl_serves(tmp_path):
 
 def test_threads_are_put_back_even_when_the_work_fails():
     before = torch.get_num_threads()
-    with pytest.raises(RuntimeError), threads(before + 1):
-        assert torch.get_num_threads() == before + 1
-        raise RuntimeError
+    inside = []
+
+    def fail():
+        with threads(before + 1):
+            inside.append(torch.get_num_threads())
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert inside == [before + 1]
     assert torch.get_num_threads() == before

@@ -116,7 +116,7 @@ def test_failures_may_be_the_violating_states_and_have_the_value_of_an_episode_w
     options = LS3Options(loss=LossOptions(failure_weight=0.5, failure_rows="violating"), optim=OPTIM)
     trainer = LS3Trainer(agent, buffer, options, episode_length=length, progress=False)
     rows = trainer.value.auxiliary.sample()
-    assert rows.batch_size == (2, agent.value.num_members)
+    assert rows.batch_size == (4, agent.value.num_members)
     assert rows["next", "constraint"].all()
     assert torch.equal(rows["latent"], rows["next", "latent"])
     value = -sum(0.99**i for i in range(steps))
@@ -210,10 +210,14 @@ def test_states_under_keys_of_ones_own_train_as_pixels_do(episode, recorder):
     encoder = TensorDictModule(torch.nn.Identity(), [keys.observation], ["latent"])
     agent = LS3Agent(action_dim=2, latent_dim=3, encoder=encoder, num_values=2, num_dynamics=2)
     buffer.encode(agent.encoder)
-    options = LS3Options(OfflineOptions(2, 2, 2, 2), optim=OPTIM, loss=LossOptions(failure_weight=0.5))
+    options = LS3Options(
+        OfflineOptions(2, 2, 2, 2), OnlineOptions(1, 1, 1), OPTIM, LossOptions(failure_weight=0.5)
+    )
     trainer = LS3Trainer(agent, buffer, options, logger=recorder, progress=False)
     trainer.train_offline()
     trainer.update()
-    assert {learner.steps for learner in trainer.learners.values()} == {2}
+    assert {name: learner.steps for name, learner in trainer.learners.items()} == {
+        name: 2 if name == "value" else 3 for name in LEARNERS
+    }
     labels = trainer.goal.sample()[keys.success].float().mean()
     assert 0.0 < labels < 1.0
