@@ -1,8 +1,10 @@
-"""The data path: tags, labels, the two-store buffer, augmentation and files."""
+"""The data path: episodes and their keys, tags, labels, the two-store buffer, augmentation and files."""
 
 from ls3_torchrl.data.augment import random_perspective, random_resized_crop
 from ls3_torchrl.data.buffer import TaggedReplayBuffer
 from ls3_torchrl.data.dataset import check_episodes, load_episodes, save_episodes
+from ls3_torchrl.data.episodes import episode_from_arrays, split_episodes
+from ls3_torchrl.data.keys import EpisodeKeys
 from ls3_torchrl.data.labels import (
     after_violation,
     failure_tail,
@@ -12,16 +14,20 @@ from ls3_torchrl.data.labels import (
     timed_out,
 )
 from ls3_torchrl.data.sampler import TagSampler
+from ls3_torchrl.data.selection import RowSelection
 from ls3_torchrl.data.tags import ALL_TAGS, VALUE_TAGS, Tag
 
 __all__ = [
     "ALL_TAGS",
     "VALUE_TAGS",
+    "EpisodeKeys",
+    "RowSelection",
     "Tag",
     "TagSampler",
     "TaggedReplayBuffer",
     "after_violation",
     "check_episodes",
+    "episode_from_arrays",
     "failure_tail",
     "in_success",
     "length_without_idle_end",
@@ -30,5 +36,6 @@ __all__ = [
     "random_resized_crop",
     "reward_to_go",
     "save_episodes",
+    "split_episodes",
     "timed_out",
 ]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import cv2
-import numpy as np
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
@@ -16,7 +16,7 @@ def random_resized_crop(
 
     Args:
         pixels: ``[B, C, H, W]``, uint8 or floats in [0, 1].
-        scale: range of the crop's share of the image's area, within (0, 1].
+        scale: range of the fraction of the image's area that the crop covers, within (0, 1].
         generator: source of randomness.
 
     Returns:
@@ -49,12 +49,12 @@ def random_perspective(
 ) -> Tensor:
     """Move each image by a random affine translation and tilt it in perspective (section 1.3.4).
 
-    The edges' pixels are carried on into what comes into view.
+    What comes into view repeats the pixels of the nearest edge.
 
     Args:
         pixels: uint8 ``[B, C, H, W]``.
-        shift: largest translation along each axis, a share of the image's side within [0, 0.5].
-        tilt: largest displacement of each corner beyond it, a share of the side within [0, 0.25].
+        shift: largest translation along each axis, a fraction of the image's side within [0, 0.5].
+        tilt: largest displacement of each corner beyond it, a fraction of the side within [0, 0.25].
         generator: source of randomness.
 
     Returns:
@@ -63,6 +63,7 @@ def random_perspective(
     Raises:
         TypeError: for images that are not uint8.
         ValueError: for a shift or tilt out of range.
+        ImportError: without OpenCV, which nothing else here needs.
 
     Example:
         >>> random_perspective(torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).shape
@@ -72,6 +73,9 @@ def random_perspective(
         raise TypeError(f"random_perspective needs uint8 images, got {pixels.dtype}.")
     if not (0.0 <= shift <= 0.5 and 0.0 <= tilt <= 0.25):
         raise ValueError(f"shift must lie in [0, 0.5] and tilt in [0, 0.25], got {shift} and {tilt}.")
+    import numpy as np
+
+    cv2 = _opencv()
     height, width = pixels.shape[-2:]
     side = np.array([width, height], dtype=np.float32)
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32) * (side - 1)
@@ -89,3 +93,15 @@ def random_perspective(
         for image, target in zip(images, moved, strict=True)
     ]
     return torch.from_numpy(np.stack(out)).movedim(-1, 1).contiguous().to(pixels.device)
+
+
+def _opencv() -> Any:
+    """OpenCV, imported where it is used: it is large, and not everywhere its libraries are."""
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError(
+            f"random_perspective needs OpenCV, which cannot be imported ({error}). Install it with "
+            "pip install 'ls3-torchrl[recipes]' or pip install opencv-python-headless."
+        ) from error
+    return cv2

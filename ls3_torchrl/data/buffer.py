@@ -1,60 +1,68 @@
-"""The replay buffer: a pixel store for the VAE, a latent store for everything else, views by tag."""
+"""The replay buffer: a store of observations for the VAE, a store of transitions for everything else, views by tag."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from torchrl.data import (
-    ImmutableDatasetWriter,
-    LazyMemmapStorage,
-    LazyTensorStorage,
-    TensorDictReplayBuffer,
-)
-from torchrl.data.replay_buffers.samplers import RandomSampler
-from torchrl.data.replay_buffers.storages import Storage
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer
 
 from ls3_torchrl._checks import require_at_least, require_finite, require_keys
-from ls3_torchrl.data.labels import (
-    after_violation,
-    failure_tail,
-    in_success,
-    length_without_idle_end,
-    reward_to_go,
-    timed_out,
-)
+from ls3_torchrl.data.encoding import encode_frames
+from ls3_torchrl.data.episode_store import EpisodeStore
+from ls3_torchrl.data.episodes import Episodes, done_steps, split_episodes
+from ls3_torchrl.data.keys import EpisodeKeys
+from ls3_torchrl.data.labels import length_without_idle_end
+from ls3_torchrl.data.rows import episode_rows, require_free, tag_of
 from ls3_torchrl.data.sampler import TagSampler
-from ls3_torchrl.data.tags import ALL_TAGS, Tag
-from ls3_torchrl.modules.vae import PixelEncoder
+from ls3_torchrl.data.selection import RowSelection
+from ls3_torchrl.data.stores import RowStore
+from ls3_torchrl.data.tags import Tag
 
 
 class TaggedReplayBuffer:
-    """Episodes in two stores: every frame's image once, and every transition with its latents and labels.
+    """Episodes in two stores: every observation once, and every transition with its latents and labels.
 
     Latents are kept as posteriors (``loc``, ``scale``) and drawn afresh whenever a row is sampled. Before an
-    encoder is known only the pixel store can be sampled; :meth:`encode` fills the latents of all rows and
+    encoder is known only observations can be sampled; :meth:`encode` fills the latents of all rows and
     keeps the encoder for the rows to come.
+
+    It can be the ``replay_buffer`` of a :class:`~torchrl.collectors.Collector` in the same process, with
+    ``trajs_per_batch``, or where a batch is whole episodes; see :meth:`extend`.
 
     Args:
         capacity: transitions kept; the oldest are overwritten.
         latent_dim: D.
-        gamma: γ of the ``reward_to_go`` labels.
+        gamma: γ of the ``reward_to_go`` labels, and of what is learnt from them.
         continue_failures: label episodes that never reach the goal as if they went on for ever
             (:func:`~ls3_torchrl.data.failure_tail`), instead of ending with the horizon.
         success_tail: steps kept of the successes that an episode ends with; ``None`` keeps all. Once the task is done
             nothing happens, and such steps can be most of the data.
-        extra_keys: entries of the episodes, beside the standard ones, that are kept with their transitions.
-        pixel_capacity: frames kept; ``None`` makes room for the same episodes, frames at both ends included.
-        scratch_dir: memory-map both stores below this folder instead of holding them in memory.
+        dynamics_after_violation: whether dynamics are to be learnt from steps behind a violation, which freezes some
+            worlds. The rows are kept all the same; who trains leaves them out with ``without="after_violation"``.
+        keys: where episodes keep their entries, and where sampled rows have them; the defaults of
+            :class:`~ls3_torchrl.data.EpisodeKeys` when ``None``.
+        extra_keys: further entries of the episodes that are kept with their transitions.
+        frame_capacity: observations kept; ``None`` keeps at least those of all transitions kept, and makes more room
+            when many short episodes need it.
+        scratch_dir: memory-map both stores below this folder instead of holding them in memory. They are of no use to
+            another buffer: the next one on the same folder starts afresh and removes them (one that is still in use
+            keeps its content). To go on with the same content, :meth:`dumps` and :meth:`loads`.
         device: where sampled batches live.
 
     Raises:
-        ValueError: for a capacity below 1, or (in :meth:`add`) data that are not finite.
+        ValueError: for a capacity below 1, a key that the buffer needs for itself, or (in :meth:`add`) data that are
+            not finite.
         KeyError: in :meth:`add`, for a missing key.
-        RuntimeError: in :meth:`sample`, without encoder or without rows of the tags; in :meth:`encode` and
-            :meth:`sample_pixel_transitions`, when frames were overwritten.
+        RuntimeError: in :meth:`sample`, without encoder or without rows of the selection; in :meth:`encode` and
+            :meth:`sample_frame_transitions`, when frames were overwritten.
 
     Example:
         >>> from ls3_torchrl.modules import PixelEncoder
@@ -63,12 +71,12 @@ class TaggedReplayBuffer:
         >>> episode = TensorDict({"pixels": step["pixels"], "action": torch.zeros(9, 2), "next": step}, [9])
         >>> buffer = TaggedReplayBuffer(capacity=100, latent_dim=8)
         >>> buffer.add(episode, "success")
-        >>> buffer.sample_pixels(4)["pixels"].shape
+        >>> buffer.sample_frames(4)["pixels"].shape
         torch.Size([4, 3, 64, 64])
         >>> buffer.encode(PixelEncoder(latent_dim=8))
         >>> buffer.sample(4, tags=["success"])["next", "latent"].shape
         torch.Size([4, 8])
-        >>> buffer.sample(4, tags=["success"], members=5)["latent"].shape
+        >>> buffer.sample(4, RowSelection(tags=["success"]), members=5)["latent"].shape
         torch.Size([4, 5, 8])
     """
 
@@ -80,266 +88,339 @@ class TaggedReplayBuffer:
         gamma: float = 0.99,
         continue_failures: bool = False,
         success_tail: int | None = None,
+        dynamics_after_violation: bool = True,
+        keys: EpisodeKeys | None = None,
         extra_keys: Iterable[NestedKey] = (),
-        pixel_capacity: int | None = None,
+        frame_capacity: int | None = None,
         scratch_dir: str | Path | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.capacity = require_at_least(capacity, 1, "capacity")
-        # An episode of T transitions has T + 1 frames; episodes of fewer than 16 steps need more room.
-        room = capacity + capacity // 16 + 64 if pixel_capacity is None else pixel_capacity
-        self.pixel_capacity = require_at_least(room, 2, "pixel_capacity")
         self.latent_dim = require_at_least(latent_dim, 1, "latent_dim")
         self.gamma = gamma
         self.continue_failures = continue_failures
         self.success_tail = None if success_tail is None else require_at_least(success_tail, 1, "success_tail")
+        self.dynamics_after_violation = dynamics_after_violation
         self.device = torch.device(device)
-        self.extra_keys = tuple(extra_keys)
-        folder = None if scratch_dir is None else Path(scratch_dir)
-
-        def storage(size: int, name: str) -> Storage:
-            if folder is None:
-                return LazyTensorStorage(size, device=self.device)
-            return LazyMemmapStorage(size, scratch_dir=str(folder / name))
-
-        self.pixels = TensorDictReplayBuffer(storage=storage(self.pixel_capacity, "pixels"), sampler=RandomSampler())
-        self.latents = TensorDictReplayBuffer(storage=storage(self.capacity, "latents"), sampler=RandomSampler())
-        self._views: dict[tuple[tuple[Tag, ...], NestedKey | None, int, float], TensorDictReplayBuffer] = {}
-        self._encoder: PixelEncoder | None = None
-        self._frames_written = 0
+        self.keys = keys or EpisodeKeys()
+        self.extra_keys = tuple(unravel_key(key) for key in extra_keys)
+        require_free((*self.keys.required, *self.extra_keys))
+        self._store = EpisodeStore(capacity, frame_capacity=frame_capacity, scratch_dir=scratch_dir, device=self.device)
+        self._views: dict[RowSelection, TensorDictReplayBuffer] = {}
+        self._encoder: TensorDictModuleBase | None = None
+        self._encoded = False
 
     def __len__(self) -> int:
-        return len(self.latents)
+        return len(self.transitions)
 
-    def add(self, episodes: TensorDictBase, tag: Tag | str) -> None:
+    @property
+    def frames(self) -> RowStore:
+        """All observations, a TorchRL replay buffer."""
+        return self._store.frames
+
+    @property
+    def transitions(self) -> RowStore:
+        """All transitions with their labels and posteriors, a TorchRL replay buffer."""
+        return self._store.transitions
+
+    @property
+    def capacity(self) -> int:
+        """Transitions that there is room for."""
+        return self._store.capacity
+
+    @property
+    def frame_capacity(self) -> int:
+        """Observations that there is room for now."""
+        return self._store.frame_capacity
+
+    @property
+    def write_count(self) -> int:
+        """Transitions written so far, overwritten ones included."""
+        return self.transitions.write_count
+
+    def add(self, episodes: Episodes, tag: Tag | str) -> None:
         """Label and store whole episodes.
 
         Args:
-            episodes: ``[T]`` or ``[N, T]`` with ``pixels``, ``action`` and, under ``next``, ``pixels``,
-                ``reward``, ``constraint`` and ``success``; each row one episode from its first step on.
+            episodes: with the entries of ``keys``, each from its first step on, in any way that
+                :func:`~ls3_torchrl.data.split_episodes` takes: ``[T]``, ``[N, T]``, or a list or lazy stack of
+                episodes of different lengths.
             tag: where they come from.
         """
         tag = Tag.parse(tag)
-        needed = ("pixels", "action", *(("next", k) for k in ("pixels", "reward", "constraint", "success")))
-        require_keys(episodes, (*needed, *self.extra_keys), "TaggedReplayBuffer.add")
-        if episodes.ndim not in (1, 2):
-            raise ValueError(f"Episodes must have batch size [T] or [N, T], got {list(episodes.shape)}.")
-        for episode in episodes.unbind(0) if episodes.ndim == 2 else [episodes]:
-            self._add_one(episode, tag)
+        self._add([(episode, tag) for episode in split_episodes(episodes)])
+
+    def extend(self, episodes: Episodes) -> Tensor:
+        """Label and store whole episodes, as a collector hands them over.
+
+        Their origin is read from the entry ``tag``, a name or number that is the same for all steps of an episode;
+        without it they are online ones.
+
+        Args:
+            episodes: as in :meth:`add`. Where they tell which steps are done, their last ones must be.
+
+        Returns:
+            Indices of the rows in :attr:`transitions`, int64 ``[n]``.
+
+        Raises:
+            ValueError: for an episode that has not ended, or of several tags.
+        """
+        tagged = [(episode, tag_of(episode)) for episode in split_episodes(episodes)]
+        for episode, _ in tagged:
+            done = done_steps(episode)
+            if done is not None and not done[-1]:
+                raise ValueError(
+                    f"An episode of {len(episode)} steps has not ended: its last step is not done. Hand over whole "
+                    "episodes: collect with Collector(..., trajs_per_batch=1), or let frames_per_batch be whole "
+                    "episodes. Episodes that were cut off on purpose go in through add(episodes, tag)."
+                )
+        return self._add(tagged)
+
+    def _add(self, tagged: list[tuple[TensorDictBase, Tag]]) -> Tensor:
+        for episode, _ in tagged:
+            require_keys(episode, (*self.keys.required, *self.extra_keys), "TaggedReplayBuffer.add")
+        indices = [self._add_one(episode, tag) for episode, tag in tagged]
         for view in self._views.values():
             view.sampler.refresh()
+        return torch.cat(indices) if indices else torch.zeros(0, dtype=torch.long)
 
-    def _add_one(self, episode: TensorDictBase, tag: Tag) -> None:
+    def _add_one(self, episode: TensorDictBase, tag: Tag) -> Tensor:
+        keys = self.keys
         if self.success_tail is not None:
-            episode = episode[: length_without_idle_end(episode["next", "success"], self.success_tail)]
-        steps = episode.shape[0]
-        if steps + 1 > self.pixel_capacity or steps > self.capacity:
-            raise ValueError(
-                f"An episode of {steps} steps does not fit a buffer of {self.capacity} transitions and "
-                f"{self.pixel_capacity} frames. Raise capacity."
-            )
-        require_finite(episode.get("action"), "The episode's action")
-        require_finite(episode.get(("next", "reward")), "The episode's reward")
-        frames = torch.cat([episode["pixels"], episode["next", "pixels"][-1:]])
-        first = self._frames_written
-        self._frames_written += steps + 1
-        self.pixels.extend(TensorDict({"pixels": frames}, [steps + 1]))
-        reward, success = episode["next", "reward"], episode["next", "success"]
-        tail = failure_tail(reward, success, self.gamma) if self.continue_failures else None
-        rows = TensorDict(
-            {
-                "action": episode["action"],
-                "tag": torch.full((steps, 1), int(tag), dtype=torch.uint8),
-                "in_success": in_success(success),
-                "after_violation": after_violation(episode["next", "constraint"]),
-                "timed_out": timed_out(success, episode["next", "constraint"]),
-                "reward_to_go": reward_to_go(reward, self.gamma, tail),
-                "frame": first + torch.arange(steps).unsqueeze(-1),
-                "steps_left": torch.arange(steps, 0, -1).unsqueeze(-1),
-                "next": {
-                    "reward": reward,
-                    "constraint": episode["next", "constraint"],
-                    "success": success,
-                },
-            },
-            [steps],
+            episode = episode[: length_without_idle_end(episode.get(keys.success), self.success_tail)]
+        self._store.require_room(len(episode))
+        require_finite(episode.get(keys.action), "The episode's action")
+        require_finite(episode.get(keys.reward), "The episode's reward")
+        frames = torch.cat([episode.get(keys.observation), episode.get(keys.next_observation)[-1:]])
+        rows = episode_rows(
+            episode,
+            self._posteriors_of_new(frames),  # before anything is written: the encoder may fail
+            tag,
+            keys=keys,
+            extra_keys=self.extra_keys,
+            gamma=self.gamma,
+            continue_failures=self.continue_failures,
         )
-        rows.update(episode.select(*self.extra_keys))
-        if self._encoder is None:
-            blank = torch.zeros(steps + 1, self.latent_dim)
-            posteriors = TensorDict({"loc": blank, "scale": blank}, [steps + 1])
-        else:
-            posteriors = self._encode_frames(frames)
-        for key in ("loc", "scale"):
-            rows[key] = posteriors[key][:-1]
-            rows["next", key] = posteriors[key][1:]
-        self.latents.extend(rows)
+        return self._store.write(TensorDict({}, [len(frames)]).set(keys.observation, frames), rows)
 
-    def encode(self, encoder: PixelEncoder, *, progress: Callable[[int, int], None] | None = None) -> None:
-        """Fill the latents of all rows, and encode the rows to come with the same, frozen encoder.
+    def _posteriors_of_new(self, frames: Tensor) -> TensorDict:
+        if self._encoder is not None:
+            return self._encode(self._encoder, frames)
+        if self._encoded:
+            raise RuntimeError(
+                "The buffer was loaded with latents, but without the encoder that new episodes need. Call "
+                "buffer.encode(encoder) before loading (on the empty buffer it only keeps the encoder), or now, "
+                "which encodes all frames again."
+            )
+        blank = torch.zeros(len(frames), self.latent_dim)
+        return TensorDict({"loc": blank, "scale": blank}, [len(frames)])
+
+    def encode(self, encoder: TensorDictModuleBase, *, progress: Callable[[int, int], None] | None = None) -> None:
+        """Fill the latents of all rows, and encode the rows to come with the same encoder.
+
+        Where it fails, the buffer stays as it was.
 
         Args:
-            encoder: the trained f_enc.
+            encoder: the trained f_enc: any module from one observation to ``loc`` and ``scale``, or to a ``latent``
+                that it is certain of. One that reads a single key may call it anything.
             progress: called with (frames done, frames in all).
         """
-        rows = self.latents.storage[:] if len(self) else None
-        self._encoder = encoder
-        if rows is None:
-            return
-        slot, after = self._slots(rows["frame"])
-        posteriors = self._encode_frames(self.pixels.storage[:]["pixels"], progress)
-        for key in ("loc", "scale"):  # in place: the rows are a view of the storage
-            rows.get(key).copy_(posteriors[key][slot])
-            rows.get(("next", key)).copy_(posteriors[key][after])
+        if len(self):
+            rows = self.transitions.storage[:]
+            slot, after = self._store.slots(rows["frame"])
+            posteriors = self._encode(encoder, self.frames.storage[:].get(self.keys.observation), progress)
+            for key in ("loc", "scale"):  # in place: the rows are a view of the storage
+                rows.get(key).copy_(posteriors[key][slot])
+                rows.get(("next", key)).copy_(posteriors[key][after])
+        self._encoder, self._encoded = encoder, True
 
-    def _slots(self, frame: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Where the pixel store keeps the frames before and after transitions, ``[B]`` each."""
-        oldest, first = self._frames_written - len(self.pixels), int(frame.min())
-        if first < oldest:
-            raise RuntimeError(
-                f"Frames older than number {oldest} were overwritten, but transitions still need frame {first}. Give "
-                f"the buffer a larger pixel_capacity (now {self.pixel_capacity})."
-            )
-        slot = frame.flatten() % self.pixel_capacity
-        return slot, (slot + 1) % self.pixel_capacity
-
-    def _encode_frames(
-        self, frames: torch.Tensor, progress: Callable[[int, int], None] | None = None, chunk: int = 512
+    def _encode(
+        self, encoder: TensorDictModuleBase, frames: Tensor, progress: Callable[[int, int], None] | None = None
     ) -> TensorDict:
-        encoder = self._encoder
-        assert encoder is not None
-        weight = next(encoder.parameters())
-        parts = []
-        with torch.no_grad():
-            for start in range(0, len(frames), chunk):
-                part = TensorDict({encoder.pixels_key: frames[start : start + chunk].to(weight.device)})
-                encoder[0](part)
-                parts.append((part.get(encoder.loc_key), part.get(encoder.scale_key)))
-                if progress is not None:
-                    progress(min(start + chunk, len(frames)), len(frames))
-        loc, scale = (torch.cat(values).to(self.device) for values in zip(*parts, strict=True))
-        if loc.shape[-1] != self.latent_dim:
-            raise ValueError(
-                f"The encoder writes latents of size {loc.shape[-1]}, but the buffer was made with "
-                f"latent_dim={self.latent_dim}. Give both the same size."
-            )
-        return TensorDict({"loc": loc, "scale": scale}, [len(frames)])
+        posteriors = encode_frames(
+            encoder, frames, key=self.keys.observation, latent_dim=self.latent_dim, progress=progress
+        )
+        return posteriors.to(self.device)
 
-    def view(
-        self,
-        tags: Iterable[Tag | str] = ALL_TAGS,
-        *,
-        without: NestedKey | None = None,
-        steps: int = 1,
-        online_fraction: float = 0.0,
-    ) -> TensorDictReplayBuffer:
-        """A TorchRL buffer on the same latent store that samples from the union of ``tags``.
+    def view(self, selection: RowSelection | None = None, **filters: Any) -> TensorDictReplayBuffer:
+        """A TorchRL buffer on the same transitions that samples from the rows of a selection.
 
         Args:
-            tags: what to draw from.
-            without: label whose rows are left out, such as ``"after_violation"``.
-            steps: only rows that so many steps of their episode begin with.
-            online_fraction: least share of online rows in a draw; see :class:`~ls3_torchrl.data.TagSampler`.
+            selection: which rows; all when neither it nor filters are given.
+            filters: its fields, in its place.
         """
-        key = (tuple(sorted({Tag.parse(tag) for tag in tags})), without, steps, online_fraction)
-        if key not in self._views:
-            self._views[key] = TensorDictReplayBuffer(
-                storage=self.latents.storage,
-                sampler=TagSampler(key[0], without=without, steps=steps, online_fraction=online_fraction),
-                writer=ImmutableDatasetWriter(),
+        selection = RowSelection.of(selection, filters)
+        if selection not in self._views:
+            self._views[selection] = TensorDictReplayBuffer(
+                storage=self.transitions.storage, sampler=TagSampler(selection), writer=ImmutableDatasetWriter()
             )
-        return self._views[key]
+        return self._views[selection]
 
-    def count(self, tags: Iterable[Tag | str] = ALL_TAGS) -> int:
-        """How many transitions carry one of the tags."""
-        view = self.view(tags)
+    def count(self, selection: RowSelection | None = None, **filters: Any) -> int:
+        """How many transitions a selection admits; the arguments are those of :meth:`view`."""
+        view = self.view(selection, **filters)
         return int(view.sampler.rows(view.storage).numel())
 
     def sample(
         self,
         batch_size: int,
+        selection: RowSelection | None = None,
         *,
-        tags: Iterable[Tag | str] = ALL_TAGS,
         members: int | None = None,
-        without: NestedKey | None = None,
-        steps: int | None = None,
-        pixels: bool = False,
-        online_fraction: float = 0.0,
+        observations: bool = False,
+        **filters: Any,
     ) -> TensorDictBase:
-        """Transitions with freshly drawn latents, uniformly from the union of the tags where no share is asked for.
+        """Transitions of a selection with freshly drawn latents, uniformly where it asks for no online fraction.
 
         Args:
             batch_size: B.
-            tags: what to draw from.
+            selection: which rows; all when neither it nor filters are given.
             members: M for a bootstrap: B transitions drawn independently for each of M members.
-            without: label whose rows are left out, such as ``"after_violation"``.
-            steps: K for stretches of K transitions of one episode, in their order.
-            pixels: add ``pixels`` and ``("next", "pixels")``; then no encoder is needed, and latents are zero without.
-            online_fraction: least share of online transitions; see :class:`~ls3_torchrl.data.TagSampler`.
+            observations: add the observations before and after; then no encoder is needed, and latents are zero
+                without.
+            filters: fields of :class:`~ls3_torchrl.data.RowSelection` in its place, such as ``tags=["success"]``.
 
         Returns:
-            ``[B]``, or ``[B, M]``, or either with K behind, with ``latent`` and ``("next", "latent")`` drawn from the
-            posteriors.
+            ``[B]``, or ``[B, M]``, or either with K behind for stretches of ``steps=K``: the entries of ``keys`` and
+            ``extra_keys``, the labels ``tag``, ``in_success``, ``after_violation``, ``timed_out`` and
+            ``reward_to_go``, and the posteriors ``loc`` and ``scale`` with ``latent`` drawn from them, here and under
+            ``next``.
         """
-        if self._encoder is None and not pixels:
+        selection = RowSelection.of(selection, filters)
+        if not (self._encoded or observations):
             raise RuntimeError("The buffer has no latents yet: call buffer.encode(encoder) after training the VAE.")
-        count = batch_size * (members or 1)
-        rows = self._stretches(count, tags, without, steps or 1, online_fraction)[1]
-        if pixels:
-            for group, slot in zip((rows, rows.get("next")), self._slots(rows["frame"]), strict=True):
-                group.set("pixels", self.pixels.storage[slot]["pixels"])
+        rows = self._stretches(batch_size * (members or 1), selection)[1]
+        if observations:
+            for group, slot in zip((rows, rows.get("next")), self._store.slots(rows["frame"]), strict=True):
+                group.set(self.keys.observation, self.frames.storage[slot].get(self.keys.observation))
         rows = rows.to(self.device)
         for group in (rows, rows.get("next")):
             loc = group.get("loc")
             group.set("latent", torch.addcmul(loc, group.get("scale"), torch.randn_like(loc)))
-        shape = (batch_size, *([] if members is None else [members]), *([] if steps is None else [steps]))
-        return rows.reshape(shape)
+        steps = [] if selection.steps is None else [selection.steps]
+        return rows.reshape(batch_size, *([] if members is None else [members]), *steps)
 
-    def _stretches(
-        self,
-        count: int,
-        tags: Iterable[Tag | str],
-        without: NestedKey | None,
-        steps: int,
-        online_fraction: float = 0.0,
-    ) -> tuple[TensorDictBase, TensorDictBase]:
+    def _stretches(self, count: int, selection: RowSelection) -> tuple[TensorDictBase, TensorDictBase]:
         """The first rows ``[count]`` of stretches of one episode each, and all of their rows ``[count * steps]``."""
-        view = self.view(tags, without=without, steps=steps, online_fraction=online_fraction)
+        view, steps = self.view(selection), selection.steps or 1
         first = view.sample(count)
         if steps == 1:
             return first, first
         row = first.get("index").reshape(count, 1) + torch.arange(steps, device=first.get("index").device)
         return first, view.storage[row.flatten() % self.capacity]
 
-    def sample_pixel_transitions(
-        self,
-        batch_size: int,
-        *,
-        tags: Iterable[Tag | str] = ALL_TAGS,
-        without: NestedKey | None = None,
-        steps: int | None = None,
+    def sample_frame_transitions(
+        self, batch_size: int, selection: RowSelection | None = None, **filters: Any
     ) -> TensorDictBase:
-        """``pixels``, ``action`` and ``("next", "pixels")`` of transitions, uniformly from the union of the tags.
+        """Observations before and after, and actions, of transitions from the rows of a selection.
 
-        Unlike :meth:`sample`, it needs no encoder. With ``steps`` K, the next pixels are those of K steps later and the
-        actions ``[B, K, A]`` lead there.
+        Unlike :meth:`sample`, it needs no encoder. With ``steps`` K, the next observation is that of K steps later and
+        the actions ``[B, K, A]`` lead there.
+
+        Args:
+            batch_size: B.
+            selection: which rows; all when neither it nor filters are given.
+            filters: its fields, in its place.
+
+        Returns:
+            ``[B]``, with the observations and the action under ``keys``.
         """
-        first, rows = self._stretches(batch_size, tags, without, steps or 1)
-        action = rows["action"] if steps is None else rows["action"].unflatten(0, (batch_size, steps))
+        selection = RowSelection.of(selection, filters)
+        keys, steps = self.keys, selection.steps
+        first, rows = self._stretches(batch_size, selection)
+        action = rows.get(keys.action)
+        batch = TensorDict({}, [batch_size])
+        batch.set(keys.action, action if steps is None else action.unflatten(0, (batch_size, steps)))
         frame = first["frame"]
-        before, after = (
-            self.pixels.storage[self._slots(number)[0]]["pixels"] for number in (frame, frame + (steps or 1))
-        )
-        batch = TensorDict({"pixels": before, "action": action, "next": {"pixels": after}}, [batch_size])
+        for key, number in ((keys.observation, frame), (keys.next_observation, frame + (steps or 1))):
+            batch.set(key, self.frames.storage[self._store.slots(number)[0]].get(keys.observation))
         return batch.to(self.device)
 
-    def sample_pixels(self, batch_size: int) -> TensorDictBase:
-        """Images ``pixels`` ``[B, C, 64, 64]``, uint8, uniformly from all frames."""
-        if len(self.pixels) == 0:
-            raise RuntimeError("The buffer holds no images yet: add episodes first.")
-        return self.pixels.sample(batch_size).to(self.device)
+    def sample_frames(self, batch_size: int) -> TensorDictBase:
+        """Observations ``[B, ...]`` under their key, uniformly from all frames."""
+        if len(self.frames) == 0:
+            raise RuntimeError("The buffer holds no frames yet: add episodes first.")
+        return self.frames.sample(batch_size).to(self.device)
 
-    def mean_image(self, *, frames: int = 4096) -> torch.Tensor:
-        """The mean of ``frames`` images drawn at random, float32 ``[C, 64, 64]`` in [0, 1]."""
-        chunks = [self.sample_pixels(512)["pixels"].float().mean(0) for _ in range(-(-frames // 512))]
-        return torch.stack(chunks).mean(0) / 255.0
+    def mean_frame(self, *, frames: int = 4096) -> Tensor:
+        """The mean of ``frames`` observations drawn at random, float32; of uint8 images it lies in [0, 1]."""
+        key, means, unit = self.keys.observation, [], 1.0
+        for _ in range(-(-frames // 512)):
+            batch = self.sample_frames(512).get(key)
+            unit = 255.0 if batch.dtype == torch.uint8 else 1.0
+            means.append(batch.float().mean(0))
+        return torch.stack(means).mean(0) / unit
+
+    def _settings(self) -> dict[str, Any]:
+        """What the content of a buffer depends on, in the form that JSON gives back."""
+        return json.loads(
+            json.dumps(
+                {
+                    "capacity": self.capacity,
+                    "latent_dim": self.latent_dim,
+                    "gamma": self.gamma,
+                    "continue_failures": self.continue_failures,
+                    "success_tail": self.success_tail,
+                    "keys": asdict(self.keys),
+                    "extra_keys": self.extra_keys,
+                }
+            )
+        )
+
+    def _require_settings(self, settings: dict[str, Any]) -> None:
+        for name, own in self._settings().items():
+            if settings[name] != own:
+                raise ValueError(
+                    f"The content was saved by a buffer with {name}={settings[name]!r}, but this one has {own!r}. "
+                    "Make the buffer with the settings of the saved one."
+                )
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of the whole content, which ``torch.load(weights_only=True)`` can read.
+
+        For content larger than memory there is :meth:`dumps`. The encoder is not part of it.
+        """
+        return {"settings": self._settings(), "encoded": self._encoded, "store": self._store.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over the content of a buffer with the same settings, which then draws the same batches.
+
+        The latents come with it. The encoder, which only new episodes need, is the one that this buffer has: call
+        :meth:`encode` before, while the buffer is empty, and nothing is encoded again.
+
+        Raises:
+            ValueError: when the settings differ.
+        """
+        self._require_settings(state_dict["settings"])
+        self._store.load_state_dict(state_dict["store"])
+        self._after_loading(state_dict["encoded"])
+
+    def dumps(self, path: str | Path) -> None:
+        """Write the whole content below the folder ``path``, over an earlier one.
+
+        Raises:
+            ValueError: for the folder that the buffer itself works in.
+            FileExistsError: for a folder with other files.
+        """
+        self._store.dumps(path, {"settings": self._settings(), "encoded": self._encoded})
+
+    def loads(self, path: str | Path) -> None:
+        """Take over what :meth:`dumps` has written, as :meth:`load_state_dict` does. No pickles are read.
+
+        Raises:
+            FileNotFoundError: when the folder holds no whole buffer.
+            ValueError: when the settings differ.
+        """
+        description = EpisodeStore.description(path)
+        self._require_settings(description["settings"])
+        self._store.loads(path)
+        self._after_loading(description["encoded"])
+
+    # The names that torchrl.checkpoint.Checkpoint looks for.
+    dump, load = dumps, loads
+
+    def _after_loading(self, encoded: bool) -> None:
+        self._encoded = encoded
+        if not encoded:
+            self._encoder = None  # its latents are not those of the rows
+        for view in self._views.values():
+            view.sampler.refresh()

@@ -3,87 +3,210 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import LazyStackedTensorDict, NestedKey, TensorDict, TensorDictBase, is_tensor_collection
+from torch import Tensor
 
 from ls3_torchrl._checks import require_finite, require_keys
+from ls3_torchrl.data.keys import EpisodeKeys, as_tuple
 from ls3_torchrl.data.tags import Tag
+from ls3_torchrl.files import save_json_atomically
 
 FORMAT = "ls3_torchrl.episodes"
-VERSION = 1
+VERSION = 2
 _DESCRIPTION = "episodes.json"
+# Branches of a stored tensordict: entries of states lie T + 1 times for an episode, entries of steps T times.
+_STATES, _STEPS = "states", "steps"
 
 
-def check_episodes(episodes: TensorDictBase, *, name: str = "episodes") -> None:
+def check_episodes(
+    episodes: TensorDictBase | list[TensorDictBase], *, keys: EpisodeKeys | None = None, name: str = "episodes"
+) -> None:
     """Check collected episodes before hours are spent on them.
 
     Args:
-        episodes: ``[N, T]`` with the standard keys.
+        episodes: ``[N, T]``, or a list or lazy stack of episodes ``[T_i]`` of different lengths.
+        keys: where they keep their entries; the defaults of :class:`~ls3_torchrl.data.EpisodeKeys` when ``None``.
+            Observations under ``"pixels"`` must be images as :class:`~ls3_torchrl.modules.PixelEncoder` takes them;
+            under another key they may be of any shape and type.
         name: how to call them in messages.
 
     Raises:
         KeyError: when a key is missing.
-        ValueError: for a wrong batch shape, wrong image shape, or data that are not finite.
+        ValueError: for a wrong batch shape, wrong image shape, observations that differ in shape or type from those
+            after them, or data that are not finite.
         TypeError: when the images are not uint8.
+
+    Example:
+        >>> from ls3_torchrl.data import episode_from_arrays
+        >>> keys = EpisodeKeys(observation="state")
+        >>> no = torch.zeros(9)
+        >>> episode = episode_from_arrays(torch.zeros(10, 4), torch.zeros(9, 2), -torch.ones(9), no, no, keys=keys)
+        >>> check_episodes([episode], keys=keys)
     """
-    needed = ("pixels", "action", *(("next", k) for k in ("pixels", "reward", "constraint", "success")))
-    require_keys(episodes, needed, name)
-    if episodes.ndim != 2:
-        raise ValueError(f"{name} must have batch size [N, T], got {list(episodes.shape)}.")
-    for key in ("pixels", ("next", "pixels")):
-        images = episodes.get(key)
-        if images.dtype != torch.uint8:
-            raise TypeError(f"{name}: {key} must be uint8 in 0..255, got {images.dtype}.")
-        if images.ndim != 5 or images.shape[-2:] != (64, 64):
-            raise ValueError(f"{name}: {key} must have shape [N, T, C, 64, 64], got {list(images.shape)}.")
-    require_finite(episodes["action"], f"{name}: action")
-    require_finite(episodes["next", "reward"], f"{name}: reward")
+    keys = keys or EpisodeKeys()
+    rows = _rows(episodes, name)
+    # Whole sets are checked at once where they can be: a pass over each episode of its own takes longer.
+    whole = [episodes] if isinstance(episodes, TensorDictBase) and _length(rows) is not None else rows
+    for part in whole:
+        require_keys(part, keys.required, name)
+        _check_observations(part, keys, name)
+        require_finite(part.get(keys.action), f"{name}: action")
+        require_finite(part.get(keys.reward), f"{name}: reward")
 
 
-def save_episodes(datasets: dict[Tag, TensorDictBase], folder: str | Path, *, task: str, seed: int) -> Path:
-    """Write episodes by tag as memory-mapped tensordicts, with a description beside them.
+def _check_observations(episodes: TensorDictBase, keys: EpisodeKeys, name: str) -> None:
+    before, after = (episodes.get(key) for key in (keys.observation, keys.next_observation))
+    for key, value in ((keys.observation, before), (keys.next_observation, after)):
+        if keys.observation == "pixels":
+            if value.dtype != torch.uint8:
+                raise TypeError(f"{name}: {key} must be uint8 in 0..255, got {value.dtype}.")
+            if value.ndim != episodes.ndim + 3 or value.shape[-2:] != (64, 64):
+                raise ValueError(f"{name}: {key} must have shape [N, T, C, 64, 64], got {list(value.shape)}.")
+        require_finite(value, f"{name}: {key}")
+    if before.shape != after.shape or before.dtype != after.dtype:
+        raise ValueError(
+            f"{name}: {keys.observation!r} and {keys.next_observation} must be alike, got {before.dtype} "
+            f"{list(before.shape)} and {after.dtype} {list(after.shape)}. Give both in one shape and type."
+        )
+
+
+def _rows(episodes: TensorDictBase | list[TensorDictBase], name: str) -> list[TensorDictBase]:
+    """Episodes ``[T_i]`` one by one."""
+    if len(episodes) == 0:
+        raise ValueError(f"{name} holds no episode. Leave its tag out.")
+    if isinstance(episodes, TensorDictBase):
+        if episodes.ndim != 2:
+            raise ValueError(f"{name} must have batch size [N, T], got {list(episodes.shape)}.")
+        return list(episodes.unbind(0))
+    for episode in episodes:
+        if episode.ndim != 1:  # not split as the buffer does: what is saved comes back as it was
+            raise ValueError(f"{name}: each episode of a list must have batch size [T], got {list(episode.shape)}.")
+    return list(episodes)
+
+
+def _length(rows: list[TensorDictBase]) -> int | None:
+    """The steps that all episodes have, or ``None`` where they differ."""
+    lengths = {len(row) for row in rows}
+    return lengths.pop() if len(lengths) == 1 else None
+
+
+def save_episodes(
+    datasets: Mapping[Tag, TensorDictBase | list[TensorDictBase]],
+    folder: str | Path,
+    *,
+    task: str,
+    seed: int,
+    keys: EpisodeKeys | None = None,
+) -> Path:
+    """Write episodes by tag to memory maps, nothing twice, with a description beside them.
+
+    Where an entry after a step (``("next", key)``) is the entry before the following step (``key``) throughout, as
+    observations are, both are stored as one of ``T + 1`` values for an episode.
 
     Args:
-        datasets: episodes ``[N, T]`` by tag.
+        datasets: episodes by tag: ``[N, T]``, or a list or lazy stack of episodes ``[T_i]`` of different lengths.
         folder: must not exist yet.
         task: name of the domain.
         seed: seed of the collection.
+        keys: where the episodes keep their entries; the defaults of :class:`~ls3_torchrl.data.EpisodeKeys` when
+            ``None``.
 
     Returns:
         The folder.
 
     Raises:
         FileExistsError: when the folder exists.
+        TypeError: for entries that are not tensors.
+        Further: as :func:`check_episodes`.
     """
     folder = Path(folder)
     if folder.exists():
         raise FileExistsError(f"{folder} exists already. Choose another folder, or remove it first.")
+    lengths: dict[str, list[int]] = {}
     for tag, episodes in datasets.items():
-        check_episodes(episodes, name=tag.name.lower())
+        check_episodes(episodes, keys=keys, name=tag.name.lower())
+        rows = _rows(episodes, tag.name.lower())
+        _require_tensors(rows, tag.name.lower())
+        lengths[tag.name.lower()] = [len(row) for row in rows]
     for tag, episodes in datasets.items():
-        episodes.contiguous().memmap(str(folder / tag.name.lower()))
-    description = {
-        "format": FORMAT,
-        "version": VERSION,
-        "task": task,
-        "seed": seed,
-        "episodes": {tag.name.lower(): list(episodes.shape) for tag, episodes in datasets.items()},
-    }
-    (folder / _DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
+        _write(_rows(episodes, tag.name.lower()), folder / tag.name.lower())
+    description = {"format": FORMAT, "version": VERSION, "task": task, "seed": seed, "episodes": lengths}
+    save_json_atomically(description, folder / _DESCRIPTION)  # last: a folder with it is whole
     return folder
 
 
-def load_episodes(folder: str | Path, *, task: str | None = None) -> dict[Tag, TensorDictBase]:
-    """Read episodes written by :func:`save_episodes`.
+def _keys(row: TensorDictBase) -> list[tuple[str, ...]]:
+    return [as_tuple(key) for key in row.keys(include_nested=True, leaves_only=True)]
+
+
+def _require_tensors(rows: list[TensorDictBase], name: str) -> None:
+    expected = set(_keys(rows[0]))
+    for row in rows:
+        if set(_keys(row)) != expected:
+            raise ValueError(
+                f"{name}: all episodes must have the same keys; these are not in all of them: "
+                f"{sorted(expected ^ set(_keys(row)))}. Leave them out with exclude()."
+            )
+    for key in expected:
+        if not isinstance(rows[0].get(key), Tensor) or is_tensor_collection(rows[0].get(key)):
+            raise TypeError(f"{name}: {key} is not a tensor, and only tensors are saved. Leave it out with exclude().")
+
+
+def _write(rows: list[TensorDictBase], folder: Path) -> None:
+    """One memory map for each entry: all episodes behind one another."""
+    steps, stored = sum(map(len, rows)), TensorDict({}).memmap_(str(folder))
+    keys = _keys(rows[0])
+    shared = {key for key in keys if key[0] != "next" and _shared(rows, key, ("next", *key))}
+    for key in keys:
+        value = rows[0].get(key)
+        if key in shared:
+            space = stored.make_memmap((_STATES, *key), (steps + len(rows), *value.shape[1:]), dtype=value.dtype)
+            for part, row in zip(space.split([len(row) + 1 for row in rows]), rows, strict=True):
+                part[:-1].copy_(row.get(key))
+                part[-1].copy_(row.get(("next", *key))[-1])
+        elif key[0] != "next" or key[1:] not in shared:
+            space = stored.make_memmap((_STEPS, *key), (steps, *value.shape[1:]), dtype=value.dtype)
+            for part, row in zip(space.split([len(row) for row in rows]), rows, strict=True):
+                part.copy_(row.get(key))
+
+
+def _shared(rows: list[TensorDictBase], key: tuple[str, ...], twin: tuple[str, ...]) -> bool:
+    """Whether the entry after each step is, bit by bit, the entry before the following one."""
+    for row in rows:
+        before, after = row.get(key), row.get(twin, None)
+        if not (isinstance(before, Tensor) and isinstance(after, Tensor)):
+            return False
+        if before.dtype != after.dtype or before.shape != after.shape or before.is_complex():
+            return False
+        if not torch.equal(_bits(before[1:]), _bits(after[:-1])):
+            return False
+    return True
+
+
+def _bits(values: Tensor) -> Tensor:
+    """Values as integers: 0.0 is not −0.0, and NaN is itself."""
+    kinds = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
+    return values.view(kinds[values.element_size()])
+
+
+def load_episodes(
+    folder: str | Path, *, task: str | None = None, keys: EpisodeKeys | None = None
+) -> dict[Tag, TensorDictBase]:
+    """Read episodes written by :func:`save_episodes`. Nothing in the folder is run as code: no pickles are read.
 
     Args:
         folder: where they lie.
         task: the domain that they must be of, if any.
+        keys: where the episodes keep their entries; the defaults of :class:`~ls3_torchrl.data.EpisodeKeys` when
+            ``None``.
 
     Returns:
-        Episodes ``[N, T]`` by tag, memory-mapped.
+        Episodes ``[N, T]`` by tag, or a lazy stack of episodes ``[T_i]`` where their lengths differ. All entries are
+        views of the memory maps: writing into them writes to the files.
 
     Raises:
         FileNotFoundError: when the folder has no description.
@@ -94,13 +217,44 @@ def load_episodes(folder: str | Path, *, task: str | None = None) -> dict[Tag, T
     if not path.is_file():
         raise FileNotFoundError(f"{folder} holds no episodes: {_DESCRIPTION} is missing. Make some with collect.py.")
     description = json.loads(path.read_text())
-    received = (description.get("format"), description.get("version"))
-    if received != (FORMAT, VERSION):
-        raise ValueError(f"{folder} holds {received}, but this version reads {(FORMAT, VERSION)}. Collect again.")
+    kind, version = description.get("format"), description.get("version")
+    if kind != FORMAT or version not in (1, VERSION):
+        raise ValueError(
+            f"{folder} holds {(kind, version)}, but {FORMAT!r} of version 1 or {VERSION} is read here. Collect again."
+        )
     if task is not None and description["task"] != task:
         raise ValueError(f"{folder} holds episodes of {description['task']!r}, but {task!r} is wanted.")
     datasets: dict[Tag, TensorDictBase] = {}
-    for name in description["episodes"]:
-        datasets[Tag.parse(name)] = TensorDict.load_memmap(str(folder / name))
-        check_episodes(datasets[Tag.parse(name)], name=name)
+    for name, lengths in description["episodes"].items():
+        stored = TensorDict.load_memmap(str(folder / name), allow_pickle=False)
+        episodes = stored if version == 1 else _read(stored, lengths)
+        check_episodes(episodes, keys=keys, name=name)
+        datasets[Tag.parse(name)] = episodes
     return datasets
+
+
+def _read(stored: TensorDictBase, lengths: list[int]) -> TensorDictBase:
+    """Views of what :func:`_write` has written."""
+    flat = {key: stored.get(key) for key in _keys(stored)}
+    if len(set(lengths)) == 1:
+        return _view(flat, len(lengths), lengths[0], 0, 0)
+    rows, start = [], 0
+    for number, steps in enumerate(lengths):
+        rows.append(_view(flat, 1, steps, start, number)[0])
+        start += steps
+    return LazyStackedTensorDict.lazy_stack(rows, 0)
+
+
+def _view(flat: dict[tuple[str, ...], Tensor], episodes: int, steps: int, start: int, number: int) -> TensorDict:
+    """So many episodes of so many steps, from the step ``start`` of all on, which belongs to episode ``number``."""
+    out = TensorDict({}, [episodes, steps])
+    for (branch, *rest), values in flat.items():
+        key: NestedKey = tuple(rest)
+        if branch == _STEPS:
+            out.set(key, values[start : start + episodes * steps].unflatten(0, (episodes, steps)))
+        else:
+            first = start + number  # each episode before it has one state more than steps
+            states = values[first : first + episodes * (steps + 1)].unflatten(0, (episodes, steps + 1))
+            out.set(key, states[:, :-1])
+            out.set(("next", *rest), states[:, 1:])
+    return out

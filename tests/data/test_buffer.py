@@ -24,7 +24,7 @@ def reading_encoder(factor=1.0):
     return encoder
 
 
-class Film:
+class Camera:
     """Makes episodes of frames numbered on and on: frame k is an image of grey value k, its action is (k, −k)."""
 
     def __init__(self):
@@ -53,7 +53,7 @@ class Film:
 
 def assert_rows_show_their_frames(buffer, numbers, factor=1.0):
     """Exactly the transitions of the frames ``numbers`` are stored, each with the posteriors of its two images."""
-    rows = buffer.latents.storage[:]
+    rows = buffer.transitions.storage[:]
     number = rows["action"][:, 0]
     assert sorted(number.int().tolist()) == sorted(numbers)
     torch.testing.assert_close(rows["loc"][:, 0], factor * number, atol=1e-2, rtol=0)
@@ -68,11 +68,11 @@ def scratch(request, tmp_path):
 
 
 def test_labels_and_tags_are_right_by_hand(scratch):
-    film = Film()
+    camera = Camera()
     buffer = TaggedReplayBuffer(20, latent_dim=D, gamma=0.5, scratch_dir=scratch)
-    buffer.add(film.shoot(3, success=[1]), "success")
-    buffer.add(film.shoot(2), Tag.CONSTRAINT)
-    rows = buffer.latents.storage[:]
+    buffer.add(camera.shoot(3, success=[1]), "success")
+    buffer.add(camera.shoot(2), Tag.CONSTRAINT)
+    rows = buffer.transitions.storage[:]
     assert len(buffer) == 5
     assert rows["tag"].flatten().tolist() == [0, 0, 0, 2, 2]
     assert rows["in_success"].flatten().tolist() == [True, True, False, False, False]
@@ -82,37 +82,37 @@ def test_labels_and_tags_are_right_by_hand(scratch):
     assert rows["next", "success"].flatten().tolist() == [False, True, False, False, False]
     assert rows["next", "reward"].flatten().tolist() == [-1.0, 0.0, -1.0, -1.0, -1.0]
     assert rows["next", "constraint"].flatten().tolist() == [True, False, False, False, False]
-    assert [buffer.count([tag]) for tag in Tag] == [3, 0, 2, 0]
+    assert [buffer.count(tags=[tag]) for tag in Tag] == [3, 0, 2, 0]
     assert buffer.count() == 5
-    assert scratch is None or any((scratch / "pixels").iterdir())
+    assert scratch is None or any((scratch / "frames").iterdir())
 
 
 def test_a_success_tail_keeps_the_labels_and_leaves_the_idle_end_out(scratch):
-    film = Film()
+    camera = Camera()
     kept, whole = (
         TaggedReplayBuffer(20, latent_dim=D, gamma=0.5, scratch_dir=scratch and scratch / name, success_tail=tail)
         for name, tail in (("kept", 2), ("whole", None))
     )
-    episode = film.shoot(8, success=[3, 4, 5, 6, 7])
+    episode = camera.shoot(8, success=[3, 4, 5, 6, 7])
     for buffer in (kept, whole):
         buffer.add(episode, "success")
-        buffer.add(film.shoot(2), "constraint")
+        buffer.add(camera.shoot(2), "constraint")
     assert (len(kept), len(whole)) == (5 + 2, 8 + 2)
     for key in ("reward_to_go", "in_success", "timed_out", "after_violation", "action", ("next", "success")):
-        assert torch.equal(kept.latents.storage[:][key][:5], whole.latents.storage[:][key][:5]), key
+        assert torch.equal(kept.transitions.storage[:][key][:5], whole.transitions.storage[:][key][:5]), key
     # Stretches end with what was kept, and every row finds its own frames.
-    assert kept.latents.storage[:]["steps_left"].flatten().tolist() == [5, 4, 3, 2, 1, 2, 1]
+    assert kept.transitions.storage[:]["steps_left"].flatten().tolist() == [5, 4, 3, 2, 1, 2, 1]
     kept.encode(reading_encoder())
-    rows = kept.latents.storage[:5]
+    rows = kept.transitions.storage[:5]
     torch.testing.assert_close(rows["next", "loc"][:, 0] - rows["loc"][:, 0], torch.ones(5), atol=1e-2, rtol=0)
     with pytest.raises(ValueError, match="success_tail must be at least 1"):
         TaggedReplayBuffer(20, success_tail=0)
 
 
 def test_extra_keys_are_kept_and_asked_for():
-    film = Film()
+    camera = Camera()
     buffer = TaggedReplayBuffer(20, latent_dim=D, extra_keys=["wish", ("next", "cost")])
-    episode = film.shoot(3)
+    episode = camera.shoot(3)
     with pytest.raises(KeyError, match="wish"):
         buffer.add(episode, "success")
     episode["wish"], episode["next", "cost"] = 2 * episode["action"], episode["action"][:, :1] + 1
@@ -125,16 +125,16 @@ def test_extra_keys_are_kept_and_asked_for():
 
 @pytest.mark.parametrize("encoded", [True, False])
 def test_pixels_come_with_their_rows_and_need_no_encoder(scratch, encoded):
-    film = Film()
-    buffer = TaggedReplayBuffer(10, latent_dim=D, pixel_capacity=13, scratch_dir=scratch)
+    camera = Camera()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, frame_capacity=13, scratch_dir=scratch)
     for _ in range(5):  # overwrites
-        buffer.add(film.shoot(4), "online")
+        buffer.add(camera.shoot(4), "online")
     if encoded:
         buffer.encode(reading_encoder())
     else:
         with pytest.raises(RuntimeError, match="no latents yet"):
             buffer.sample(4)
-    rows = buffer.sample(40, pixels=True, members=2)
+    rows = buffer.sample(40, observations=True, members=2)
     assert rows["pixels"].shape == (40, 2, 3, 64, 64)
     assert torch.equal(rows["pixels"][..., 0, 0, 0].float(), rows["action"][..., 0])
     assert torch.equal(rows["next", "pixels"][..., 0, 0, 0].float(), rows["action"][..., 0] + 1)
@@ -142,85 +142,85 @@ def test_pixels_come_with_their_rows_and_need_no_encoder(scratch, encoded):
 
 
 def test_frames_match_rows_when_encoded_at_the_end(scratch):
-    film = Film()
+    camera = Camera()
     buffer = TaggedReplayBuffer(20, latent_dim=D, scratch_dir=scratch)
-    buffer.add(film.shoot(3), "success")
-    buffer.add(film.shoot(4), "rand")
+    buffer.add(camera.shoot(3), "success")
+    buffer.add(camera.shoot(4), "rand")
     buffer.encode(reading_encoder())
     # Frames 3 and 8 end their episodes: they start no transition.
     assert_rows_show_their_frames(buffer, [0, 1, 2, 4, 5, 6, 7])
 
 
 def test_frames_match_rows_of_episodes_added_after_encoding(scratch):
-    film = Film()
+    camera = Camera()
     buffer = TaggedReplayBuffer(20, latent_dim=D, scratch_dir=scratch)
     buffer.encode(reading_encoder())  # nothing there yet
-    buffer.add(film.shoot(3), "success")
+    buffer.add(camera.shoot(3), "success")
     assert_rows_show_their_frames(buffer, [0, 1, 2])
 
 
 def test_both_rings_wrap_round_and_keep_images_labels_and_tags_together(scratch):
-    film = Film()
-    buffer = TaggedReplayBuffer(10, latent_dim=D, gamma=0.5, pixel_capacity=14, scratch_dir=scratch)
-    buffer.add(film.shoot(4), "success")  # frames 0 to 4
-    buffer.add(film.shoot(4, success=[3]), "rand")  # 5 to 9
+    camera = Camera()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, gamma=0.5, frame_capacity=14, scratch_dir=scratch)
+    buffer.add(camera.shoot(4), "success")  # frames 0 to 4
+    buffer.add(camera.shoot(4, success=[3]), "rand")  # 5 to 9
     buffer.encode(reading_encoder())
-    buffer.add(film.shoot(4, success=[0]), "online")  # 10 to 14: both stores write over their oldest
+    buffer.add(camera.shoot(4, success=[0]), "online")  # 10 to 14: both stores write over their oldest
     left = [2, 3, 5, 6, 7, 8, 10, 11, 12, 13]
     assert len(buffer) == 10
-    assert len(buffer.pixels) == 14
+    assert len(buffer.frames) == 14
     assert_rows_show_their_frames(buffer, left)
     # A better encoder later must find each row's images again, in the ring as it lies now.
     buffer.encode(reading_encoder(factor=2.0))
     assert_rows_show_their_frames(buffer, left, factor=2.0)
-    rows = buffer.latents.storage[:]
+    rows = buffer.transitions.storage[:]
     by_frame = dict(zip(rows["action"][:, 0].int().tolist(), range(10), strict=True))
     order = [by_frame[number] for number in left]
     assert rows["tag"].flatten()[order].tolist() == [0, 0, 1, 1, 1, 1, 3, 3, 3, 3]
     assert rows["in_success"].flatten()[order].tolist() == [False] * 2 + [True] * 5 + [False] * 3
     expected = [-1.5, -1.0, -1.75, -1.5, -1.0, 0.0, -0.875, -1.75, -1.5, -1.0]
     assert rows["reward_to_go"].flatten()[order].tolist() == expected
-    assert [buffer.count([tag]) for tag in Tag] == [2, 4, 0, 4]
-    shown = buffer.pixels.storage[:]["pixels"][:, 0, 0, 0]
+    assert [buffer.count(tags=[tag]) for tag in Tag] == [2, 4, 0, 4]
+    shown = buffer.frames.storage[:]["pixels"][:, 0, 0, 0]
     assert sorted(shown.tolist()) == list(range(1, 15))
 
 
 def test_many_rounds_of_the_ring_stay_consistent():
-    film = Film()
-    buffer = TaggedReplayBuffer(9, latent_dim=D, pixel_capacity=13)
+    camera = Camera()
+    buffer = TaggedReplayBuffer(9, latent_dim=D, frame_capacity=13)
     for i, steps in enumerate([5, 3, 7, 2, 6, 4, 8, 5]):
-        buffer.add(film.shoot(steps), "online")
+        buffer.add(camera.shoot(steps), "online")
         if i == 3:
             buffer.encode(reading_encoder())
-    # The last nine transitions: the last five of the film, and four of the eight before.
-    last = film.frame - 6
+    # The last nine transitions: the last five of the camera, and four of the eight before.
+    last = camera.frame - 6
     assert_rows_show_their_frames(buffer, [*range(last - 5, last - 1), *range(last, last + 5)])
 
 
 def test_a_batch_of_episodes_is_stored_one_after_another():
-    film = Film()
+    camera = Camera()
     buffer = TaggedReplayBuffer(20, latent_dim=D, gamma=0.5)
-    buffer.add(torch.stack([film.shoot(3), film.shoot(3, success=[2])]), "success")
+    buffer.add(torch.stack([camera.shoot(3), camera.shoot(3, success=[2])]), "success")
     buffer.encode(reading_encoder())
     assert_rows_show_their_frames(buffer, [0, 1, 2, 4, 5, 6])
     # Labels stop at the episode's end: the second episode's success is not the first one's.
-    assert buffer.latents.storage[:]["in_success"].flatten().tolist() == [False] * 3 + [True] * 3
+    assert buffer.transitions.storage[:]["in_success"].flatten().tolist() == [False] * 3 + [True] * 3
 
 
 def test_overwritten_frames_are_refused_at_encoding_not_mixed_up():
-    film = Film()
-    buffer = TaggedReplayBuffer(10, latent_dim=D, pixel_capacity=10)
+    camera = Camera()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, frame_capacity=10)
     for _ in range(3):
-        buffer.add(film.shoot(4), "success")
-    with pytest.raises(RuntimeError, match=r"older than number 5 were overwritten.*need frame 2.*pixel_capacity"):
+        buffer.add(camera.shoot(4), "success")
+    with pytest.raises(RuntimeError, match=r"older than number 5 were overwritten.*need frame 2.*frame_capacity"):
         buffer.encode(reading_encoder())
 
 
 def test_latents_are_drawn_anew_from_the_posterior_at_each_use():
     torch.manual_seed(0)
-    film = Film()
+    camera = Camera()
     buffer = TaggedReplayBuffer(20, latent_dim=D)
-    buffer.add(film.shoot(1), "success")  # one row: every draw is of frames 0 and 1
+    buffer.add(camera.shoot(1), "success")  # one row: every draw is of frames 0 and 1
     buffer.encode(reading_encoder())
     batch = buffer.sample(4000)
     for group in (batch, batch["next"]):
@@ -230,14 +230,14 @@ def test_latents_are_drawn_anew_from_the_posterior_at_each_use():
         assert (noise.std() - 1).abs() < 0.03
     here, there = ((group["latent"] - group["loc"]).flatten() for group in (batch, batch["next"]))
     assert torch.corrcoef(torch.stack([here, there]))[0, 1].abs() < 0.04
-    assert "latent" not in set(buffer.latents.storage[:].keys())  # drawn, never stored
+    assert "latent" not in set(buffer.transitions.storage[:].keys())  # drawn, never stored
 
 
 def test_members_get_batches_of_their_own():
     torch.manual_seed(0)
-    film = Film()
+    camera = Camera()
     buffer = TaggedReplayBuffer(20, latent_dim=D)
-    buffer.add(film.shoot(8), "success")
+    buffer.add(camera.shoot(8), "success")
     buffer.encode(reading_encoder())
     batch = buffer.sample(6400, members=2)
     assert batch.batch_size == (6400, 2)
@@ -252,13 +252,13 @@ def test_members_get_batches_of_their_own():
 
 
 def test_sample_honours_tags_added_before_and_after_a_view_was_made():
-    film = Film()
+    camera = Camera()
     buffer = TaggedReplayBuffer(40, latent_dim=D)
     buffer.encode(reading_encoder())
-    buffer.add(film.shoot(2), "success")
+    buffer.add(camera.shoot(2), "success")
     assert set(buffer.sample(64, tags=["success"])["tag"].flatten().tolist()) == {0}
-    buffer.add(film.shoot(2), "online")
-    buffer.add(film.shoot(2), "success")
+    buffer.add(camera.shoot(2), "online")
+    buffer.add(camera.shoot(2), "success")
     frames = buffer.sample(500, tags=["success"])["action"][:, 0]
     assert set(frames.int().tolist()) == {0, 1, 6, 7}
     assert set(buffer.sample(500)["tag"].flatten().tolist()) == {0, 3}
@@ -267,19 +267,19 @@ def test_sample_honours_tags_added_before_and_after_a_view_was_made():
 @pytest.mark.parametrize("how", [{}, {"members": 2}, {"steps": 2}, {"without": "after_violation"}])
 def test_online_rows_have_their_share_of_every_kind_of_batch(how):
     torch.manual_seed(0)
-    film = Film()
+    camera = Camera()
     buffer = TaggedReplayBuffer(200, latent_dim=D)
     buffer.encode(reading_encoder())
     for _ in range(30):  # a frame in three violates, and what comes after it is frozen
-        buffer.add(film.shoot(3), "success")
-    buffer.add(film.shoot(5), "online")
+        buffer.add(camera.shoot(3), "success")
+    buffer.add(camera.shoot(5), "online")
     batch = buffer.sample(400, online_fraction=0.5, **how)
     assert batch.batch_size[0] == 400
     assert (batch["tag"] == int(Tag.ONLINE)).float().mean() == 0.5
     assert (buffer.sample(400, **how)["tag"] == int(Tag.ONLINE)).float().mean() < 0.25
     # What is asked of rows holds for both parts.
     if "without" in how:
-        assert buffer.latents.storage[:]["after_violation"].any()
+        assert buffer.transitions.storage[:]["after_violation"].any()
         assert not batch["after_violation"].any()
     if "steps" in how:
         number = batch["action"][..., 0]
@@ -288,7 +288,7 @@ def test_online_rows_have_their_share_of_every_kind_of_batch(how):
 
 def test_sample_without_rows_of_the_tag_names_it():
     buffer = TaggedReplayBuffer(20, latent_dim=D)
-    buffer.add(Film().shoot(2), "success")
+    buffer.add(Camera().shoot(2), "success")
     buffer.encode(reading_encoder())
     with pytest.raises(RuntimeError, match="no data tagged 'constraint'"):
         buffer.sample(4, tags=["constraint"])
@@ -296,7 +296,7 @@ def test_sample_without_rows_of_the_tag_names_it():
 
 def test_sample_before_encoding_says_what_to_do():
     buffer = TaggedReplayBuffer(20, latent_dim=D)
-    buffer.add(Film().shoot(2), "success")
+    buffer.add(Camera().shoot(2), "success")
     with pytest.raises(RuntimeError, match=r"call buffer\.encode"):
         buffer.sample(4)
 
@@ -304,10 +304,10 @@ def test_sample_before_encoding_says_what_to_do():
 def test_pixels_are_sampled_uniformly_from_all_frames_last_ones_included(scratch):
     torch.manual_seed(0)
     buffer = TaggedReplayBuffer(20, latent_dim=D, scratch_dir=scratch)
-    with pytest.raises(RuntimeError, match="no images yet"):
-        buffer.sample_pixels(4)
-    buffer.add(Film().shoot(3), "success")
-    pixels = buffer.sample_pixels(400)["pixels"]
+    with pytest.raises(RuntimeError, match="no frames yet"):
+        buffer.sample_frames(4)
+    buffer.add(Camera().shoot(3), "success")
+    pixels = buffer.sample_frames(400)["pixels"]
     assert pixels.dtype == torch.uint8
     assert pixels.shape == (400, 3, 64, 64)
     assert (torch.bincount(pixels[:, 0, 0, 0].long(), minlength=4) - 100).abs().max() < 45
@@ -315,26 +315,26 @@ def test_pixels_are_sampled_uniformly_from_all_frames_last_ones_included(scratch
 
 def test_pixel_transitions_join_both_images_to_their_action_after_the_ring_wrapped(scratch):
     torch.manual_seed(0)
-    film = Film()
-    buffer = TaggedReplayBuffer(10, latent_dim=D, pixel_capacity=13, scratch_dir=scratch)
+    camera = Camera()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, frame_capacity=13, scratch_dir=scratch)
     for tag in ("success", "constraint", "online"):
-        buffer.add(film.shoot(4), tag)
-    batch = buffer.sample_pixel_transitions(400)  # no encoder yet
+        buffer.add(camera.shoot(4), tag)
+    batch = buffer.sample_frame_transitions(400)  # no encoder yet
     number = batch["action"][:, 0].int()
     assert set(number.tolist()) == {2, 3, 5, 6, 7, 8, 10, 11, 12, 13}
     assert torch.equal(batch["pixels"][:, 0, 0, 0].int(), number)
     assert torch.equal(batch["next", "pixels"][:, 2, 5, 7].int(), number + 1)
-    assert set(buffer.sample_pixel_transitions(200, tags=["online"])["action"][:, 0].tolist()) == {10, 11, 12, 13}
+    assert set(buffer.sample_frame_transitions(200, tags=["online"])["action"][:, 0].tolist()) == {10, 11, 12, 13}
 
 
 def test_stretches_follow_one_episode_over_the_rings_end(scratch):
     torch.manual_seed(0)
-    film = Film()
+    camera = Camera()
     buffer = TaggedReplayBuffer(10, latent_dim=D, scratch_dir=scratch)
     for tag in ("success", "constraint", "online"):
-        buffer.add(film.shoot(4), tag)
+        buffer.add(camera.shoot(4), tag)
     # Left of frames 0-3, 5-8, 10-13: transitions 2, 3, 5-8, 10-13, of which the last lie at the ring's start.
-    pixels = buffer.sample_pixel_transitions(200, steps=3)
+    pixels = buffer.sample_frame_transitions(200, steps=3)
     number = pixels["action"][..., 0].int()
     assert set(number[:, 0].tolist()) == {5, 6, 10, 11}
     assert torch.equal(number, number[:, :1] + torch.arange(3))
@@ -352,27 +352,27 @@ def test_stretches_follow_one_episode_over_the_rings_end(scratch):
 
 
 def test_pixel_transitions_whose_images_are_gone_are_refused():
-    film = Film()
-    buffer = TaggedReplayBuffer(10, latent_dim=D, pixel_capacity=10)
+    camera = Camera()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, frame_capacity=10)
     for _ in range(3):
-        buffer.add(film.shoot(4), "success")
-    with pytest.raises(RuntimeError, match=r"older than number 5 were overwritten.*pixel_capacity"):
-        buffer.sample_pixel_transitions(200)
+        buffer.add(camera.shoot(4), "success")
+    with pytest.raises(RuntimeError, match=r"older than number 5 were overwritten.*frame_capacity"):
+        buffer.sample_frame_transitions(200)
 
 
 @pytest.mark.parametrize(("key", "what"), [("action", "action"), (("next", "reward"), "reward")])
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
 def test_numbers_that_are_not_finite_never_get_in(key, what, bad):
-    episode = Film().shoot(3)
+    episode = Camera().shoot(3)
     episode[key][1, 0] = bad
     buffer = TaggedReplayBuffer(20, latent_dim=D)
     with pytest.raises(ValueError, match=f"episode's {what} is not finite: 1 of"):
         buffer.add(episode, "success")
-    assert len(buffer) == len(buffer.pixels) == 0
+    assert len(buffer) == len(buffer.frames) == 0
 
 
 def test_missing_keys_wrong_shapes_and_unknown_tags_are_refused():
-    episode = Film().shoot(3)
+    episode = Camera().shoot(3)
     buffer = TaggedReplayBuffer(20, latent_dim=D)
     with pytest.raises(KeyError, match="constraint"):
         buffer.add(episode.exclude(("next", "constraint")), "success")
@@ -383,14 +383,14 @@ def test_missing_keys_wrong_shapes_and_unknown_tags_are_refused():
     assert len(buffer) == 0
 
 
-@pytest.mark.parametrize("sizes", [{"capacity": 3}, {"capacity": 20, "pixel_capacity": 4}])
+@pytest.mark.parametrize("sizes", [{"capacity": 3}, {"capacity": 20, "frame_capacity": 4}])
 def test_an_episode_longer_than_the_buffer_is_refused(sizes):
     with pytest.raises(ValueError, match="4 steps does not fit"):
-        TaggedReplayBuffer(latent_dim=D, **sizes).add(Film().shoot(4), "success")
+        TaggedReplayBuffer(latent_dim=D, **sizes).add(Camera().shoot(4), "success")
 
 
 @pytest.mark.parametrize(
-    "sizes", [{"capacity": 0}, {"capacity": 5, "pixel_capacity": 1}, {"capacity": 5, "latent_dim": 0}]
+    "sizes", [{"capacity": 0}, {"capacity": 5, "frame_capacity": 1}, {"capacity": 5, "latent_dim": 0}]
 )
 def test_impossible_sizes_are_refused(sizes):
     with pytest.raises(ValueError, match="must be at least"):
@@ -399,33 +399,33 @@ def test_impossible_sizes_are_refused(sizes):
 
 def test_an_encoder_of_another_size_is_refused():
     buffer = TaggedReplayBuffer(20, latent_dim=D)
-    buffer.add(Film().shoot(2), "success")
+    buffer.add(Camera().shoot(2), "success")
     with pytest.raises(ValueError, match=r"latents of size 6.*latent_dim=4"):
         buffer.encode(PixelEncoder(latent_dim=6))
 
 
 def test_the_default_pixel_store_keeps_all_frames_of_the_stored_rows():
     # Short episodes have many frames that start no transition; 16 steps are what the default allows for.
-    film = Film()
+    camera = Camera()
     buffer = TaggedReplayBuffer(96, latent_dim=D)
     for _ in range(8):
-        buffer.add(film.shoot(16), "online")
+        buffer.add(camera.shoot(16), "online")
     buffer.encode(reading_encoder())
     assert_rows_show_their_frames(buffer, [i for i in range(34, 136) if i % 17 != 16])
 
 
 def test_encoding_reports_its_progress():
     buffer = TaggedReplayBuffer(20, latent_dim=D)
-    buffer.add(Film().shoot(5), "success")
+    buffer.add(Camera().shoot(5), "success")
     calls = []
     buffer.encode(reading_encoder(), progress=lambda done, total: calls.append((done, total)))
     assert calls[-1] == (6, 6)
 
 
-def test_the_mean_image_is_that_of_all_frames_in_unit_floats(scratch):
+def test_the_mean_frame_is_that_of_all_frames_in_unit_floats(scratch):
     buffer = TaggedReplayBuffer(20, latent_dim=D, scratch_dir=scratch)
-    buffer.add(Film().shoot(9), "success")  # grey values 0 to 9
+    buffer.add(Camera().shoot(9), "success")  # grey values 0 to 9
     torch.manual_seed(0)
-    mean = buffer.mean_image(frames=20_000)
+    mean = buffer.mean_frame(frames=20_000)
     assert mean.shape == (3, 64, 64)
     torch.testing.assert_close(mean, torch.full_like(mean, 4.5 / 255), atol=0.1 / 255, rtol=0)

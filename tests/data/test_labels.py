@@ -56,12 +56,12 @@ def test_in_success_keeps_the_rows_of_a_batch_apart():
         ([0, 0, 1], [0, 1, 0], False),
     ],
 )
-def test_undecided_is_neither_a_success_nor_a_violation(success, constraint, expected):
+def test_timed_out_is_neither_a_success_nor_a_violation(success, constraint, expected):
     outcome = (torch.tensor(values).bool().unsqueeze(-1) for values in (success, constraint))
     assert timed_out(*outcome).flatten().tolist() == [expected] * 3
 
 
-def test_undecided_keeps_the_rows_of_a_batch_apart():
+def test_timed_out_keeps_the_rows_of_a_batch_apart():
     success = torch.zeros(2, 5, 1, dtype=torch.bool)
     success[0, 3] = True
     assert timed_out(success, torch.zeros_like(success)).squeeze(-1).int().tolist() == [[0] * 5, [1] * 5]
@@ -95,7 +95,7 @@ def test_an_undiscounted_tail_is_refused():
         failure_tail(-torch.ones(3, 1), torch.zeros(3, 1, dtype=torch.bool), 1.0)
 
 
-def test_frozen_are_the_steps_after_the_first_violation_row_by_row():
+def test_after_violation_marks_the_steps_behind_the_first_violation_row_by_row():
     constraint = torch.zeros(3, 5, 1, dtype=torch.bool)
     constraint[0, 2:] = True
     constraint[1, 1] = True  # even where the flag does not stay

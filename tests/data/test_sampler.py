@@ -3,7 +3,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from ls3_torchrl.data import Tag, TagSampler
+from ls3_torchrl.data import RowSelection, Tag, TagSampler
 
 
 def rows(tags, first=0):
@@ -14,7 +14,7 @@ def rows(tags, first=0):
 
 
 def buffer_of(tags, wanted, capacity=64):
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), sampler=TagSampler(wanted))
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), sampler=TagSampler(RowSelection(tags=wanted)))
     buffer.extend(rows(tags))
     return buffer
 
@@ -39,7 +39,9 @@ def test_rows_are_the_indices_of_the_tags():
 
 @pytest.mark.parametrize("tags", [[], [0, 0, 3]])
 def test_a_tag_without_rows_says_which_and_what_to_do(tags):
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8), sampler=TagSampler(["constraint", "rand"]))
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(8), sampler=TagSampler(RowSelection(tags=["constraint", "rand"]))
+    )
     if tags:
         buffer.extend(rows(tags))
     with pytest.raises(RuntimeError, match=rf"{len(tags)} rows.*'rand', 'constraint'.*Collect"):
@@ -48,21 +50,21 @@ def test_a_tag_without_rows_says_which_and_what_to_do(tags):
 
 def test_rows_that_say_so_are_left_out():
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(8), sampler=TagSampler(["success"], without="after_violation")
+        storage=LazyTensorStorage(8), sampler=TagSampler(RowSelection(tags=["success"], without="after_violation"))
     )
-    frozen = torch.tensor([False, True, False, False]).unsqueeze(-1)
-    buffer.extend(rows([0, 0, 1, 0]).set("after_violation", frozen))
+    after = torch.tensor([False, True, False, False]).unsqueeze(-1)
+    buffer.extend(rows([0, 0, 1, 0]).set("after_violation", after))
     assert buffer.sampler.rows(buffer.storage).tolist() == [0, 3]
 
 
 def test_no_tag_at_all_is_refused():
     with pytest.raises(ValueError, match="at least one tag"):
-        TagSampler([])
+        RowSelection(tags=[])
 
 
 def test_unknown_tag_is_refused():
     with pytest.raises(ValueError, match="Unknown tag 'demo'"):
-        TagSampler(["demo"])
+        RowSelection(tags=["demo"])
 
 
 def test_rows_written_after_a_draw_are_found():
@@ -90,26 +92,30 @@ def test_relabelled_rows_are_seen_after_refresh():
 
 
 def test_nested_tag_key():
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8), sampler=TagSampler(["rand"], tag_key=("meta", "tag")))
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(8), sampler=TagSampler(RowSelection(tags=["rand"]), tag_key=("meta", "tag"))
+    )
     buffer.extend(TensorDict({"meta": {"tag": torch.tensor([[0], [1]], dtype=torch.uint8)}}, [2]))
     assert buffer.sample(3)["meta", "tag"].flatten().tolist() == [1, 1, 1]
 
 
-def shares(buffer, count=400):
-    """Share of each of the first four tags in a draw."""
+def fractions(buffer, count=400):
+    """Fraction of each of the first four tags in a draw."""
     return (torch.bincount(buffer.sample(count)["tag"].flatten().long(), minlength=4) / count).tolist()
 
 
-def buffer_with_share(tags, share, wanted=("success", "rand", "online")):
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(256), sampler=TagSampler(wanted, online_fraction=share))
+def buffer_with_fraction(tags, fraction, wanted=("success", "rand", "online")):
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(256), sampler=TagSampler(RowSelection(tags=wanted, online_fraction=fraction))
+    )
     buffer.extend(rows(tags))
     return buffer
 
 
-def test_few_online_rows_have_their_share_and_the_others_stay_uniform():
+def test_few_online_rows_have_their_fraction_and_the_others_stay_uniform():
     torch.manual_seed(0)
-    buffer = buffer_with_share([0] * 60 + [1] * 30 + [3] * 10, share=0.5)
-    success, rand, constraint, online = shares(buffer, 30_000)
+    buffer = buffer_with_fraction([0] * 60 + [1] * 30 + [3] * 10, fraction=0.5)
+    success, rand, constraint, online = fractions(buffer, 30_000)
     assert online == 0.5
     assert constraint == 0.0
     assert abs(success - 2 * rand) < 0.02  # 60 rows to 30
@@ -122,19 +128,19 @@ def test_few_online_rows_have_their_share_and_the_others_stay_uniform():
 @pytest.mark.parametrize(("tags", "online"), [([0] * 10, 0.0), ([3] * 10, 1.0), ([0] * 10 + [3] * 90, 0.9)])
 def test_none_and_many_online_rows_are_drawn_as_they_are(tags, online):
     torch.manual_seed(0)
-    assert abs(shares(buffer_with_share(tags, share=0.5), 10_000)[3] - online) < 0.02
+    assert abs(fractions(buffer_with_fraction(tags, fraction=0.5), 10_000)[3] - online) < 0.02
 
 
-def test_the_share_follows_rows_that_come_later():
-    buffer = buffer_with_share([0] * 90, share=0.25)
-    assert shares(buffer)[3] == 0.0
+def test_the_fraction_follows_rows_that_come_later():
+    buffer = buffer_with_fraction([0] * 90, fraction=0.25)
+    assert fractions(buffer)[3] == 0.0
     buffer.extend(rows([3] * 3, first=90))
-    assert shares(buffer)[3] == 0.25
+    assert fractions(buffer)[3] == 0.25
     buffer.extend(rows([3] * 150, first=93))
-    assert shares(buffer)[3] > 0.5
+    assert fractions(buffer)[3] > 0.5
 
 
-@pytest.mark.parametrize("share", [-0.1, 1.0])
-def test_impossible_shares_are_refused(share):
-    with pytest.raises(ValueError, match=rf"online_fraction must be in \[0, 1\), got {share}"):
-        TagSampler(["online"], online_fraction=share)
+@pytest.mark.parametrize("fraction", [-0.1, 1.0])
+def test_impossible_fractions_are_refused(fraction):
+    with pytest.raises(ValueError, match=rf"online_fraction must be in \[0, 1\), got {fraction}"):
+        RowSelection(tags=["online"], online_fraction=fraction)

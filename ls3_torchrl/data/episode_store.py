@@ -1,0 +1,163 @@
+"""Observations and the transitions between them, in two rings that keep together."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ls3_torchrl._checks import require_at_least
+from ls3_torchrl.data.stores import RowStore
+from ls3_torchrl.files import save_json_atomically
+
+_DESCRIPTION = "buffer.json"
+
+
+class EpisodeStore:
+    """The frames of episodes, each stored once, and their transitions, which know their frames by number.
+
+    An episode of T transitions has T + 1 frames. Frames are numbered as they are written, and transitions keep the
+    number of their first one under ``frame``.
+
+    Args:
+        capacity: transitions kept; the oldest are overwritten.
+        frame_capacity: frames kept; ``None`` keeps at least those of all transitions kept: room for episodes of 16
+            steps, and more as soon as there are shorter ones.
+        scratch_dir: memory-map both rings in the folders ``frames`` and ``transitions`` below this one.
+        device: where rings in memory live.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> store = EpisodeStore(100)
+        >>> frames = TensorDict({"state": torch.arange(4.0).unsqueeze(-1)}, [4])
+        >>> rows = TensorDict({"action": torch.zeros(3, 2)}, [3])
+        >>> store.write(frames, rows).tolist(), rows["frame"].flatten().tolist()
+        ([0, 1, 2], [0, 1, 2])
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        *,
+        frame_capacity: int | None = None,
+        scratch_dir: str | Path | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.capacity = require_at_least(capacity, 1, "capacity")
+        self._grows = frame_capacity is None
+        room = capacity + capacity // 16 + 64 if frame_capacity is None else frame_capacity
+        require_at_least(room, 2, "frame_capacity")
+        folders = [None if scratch_dir is None else Path(scratch_dir) / name for name in ("frames", "transitions")]
+        self.scratch_dir = None if scratch_dir is None else Path(scratch_dir)
+        self.frames = RowStore(room, folder=folders[0], device=device)
+        self.transitions = RowStore(capacity, folder=folders[1], device=device)
+        self._frames_written = 0
+        # Frame number n lies in slot (n - shift) % frame_capacity.
+        self._shift = 0
+
+    @property
+    def frame_capacity(self) -> int:
+        """Frames that there is room for now."""
+        return self.frames.capacity
+
+    def require_room(self, steps: int) -> None:
+        """Raise ``ValueError`` when an episode of so many steps is too long."""
+        if steps + 1 > self.frame_capacity or steps > self.capacity:
+            raise ValueError(
+                f"An episode of {steps} steps does not fit a buffer of {self.capacity} transitions and "
+                f"{self.frame_capacity} frames. Raise capacity."
+            )
+
+    def write(self, frames: TensorDictBase, rows: TensorDictBase) -> Tensor:
+        """Write an episode's frames ``[T + 1]`` and transitions ``[T]``; returns rows, int64 ``[T]``."""
+        steps = len(rows)
+        self._make_room(steps)
+        rows.set("frame", self._frames_written + torch.arange(steps).unsqueeze(-1))
+        self.frames.extend(frames)
+        self._frames_written += steps + 1
+        return self.transitions.extend(rows)
+
+    def _make_room(self, steps: int) -> None:
+        """Let the ring of frames grow where an episode would overwrite frames of transitions that stay."""
+        written = self.transitions.write_count
+        oldest = max(written + steps - self.capacity, 0)  # number of the oldest transition that stays
+        if not self._grows or oldest >= written:
+            return
+        frame = int(self.transitions.storage[oldest % self.capacity]["frame"])
+        needed = self._frames_written + steps + 1 - frame
+        if needed > self.frame_capacity:
+            self._shift = self._frames_written - len(self.frames)
+            # Two frames for each transition are enough even where all episodes have one step.
+            self.frames.grow(min(max(needed, self.frame_capacity * 3 // 2), 2 * self.capacity))
+
+    def slots(self, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """Where frames of these numbers and those after them lie, ``[B]`` each.
+
+        Raises:
+            RuntimeError: when they were overwritten.
+        """
+        oldest, first = self._frames_written - len(self.frames), int(frame.min())
+        if first < oldest:
+            raise RuntimeError(
+                f"Frames older than number {oldest} were overwritten, but transitions still need frame {first}. Give "
+                f"the buffer a larger frame_capacity (now {self.frame_capacity}), or None for as many as are needed."
+            )
+        slot = (frame.flatten() - self._shift) % self.frame_capacity
+        return slot, (slot + 1) % self.frame_capacity
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of both rings and the counters."""
+        rings = {"frames": self.frames.state_dict(), "transitions": self.transitions.state_dict()}
+        return {**rings, "counters": self._counters()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over both rings and the counters."""
+        self.frames.load_state_dict(state_dict["frames"])
+        self.transitions.load_state_dict(state_dict["transitions"])
+        self._set_counters(state_dict["counters"])
+
+    def dumps(self, path: str | Path, description: dict[str, Any]) -> None:
+        """Write both rings, the counters and a description below the folder ``path``, over earlier ones.
+
+        Raises:
+            ValueError: for the ``scratch_dir``.
+            FileExistsError: where other files lie in the way.
+        """
+        path = Path(path)
+        if self.scratch_dir is not None and path.resolve() == self.scratch_dir.resolve():
+            raise ValueError(f"{path} is the buffer's scratch_dir. Choose another folder to save to.")
+        (path / _DESCRIPTION).unlink(missing_ok=True)
+        self.frames.dumps(path / "frames")
+        self.transitions.dumps(path / "transitions")
+        # Last: a folder with it is whole.
+        save_json_atomically({**description, "counters": self._counters()}, path / _DESCRIPTION)
+
+    @staticmethod
+    def description(path: str | Path) -> dict[str, Any]:
+        """What was written beside the rings.
+
+        Raises:
+            FileNotFoundError: when the folder holds no whole store.
+        """
+        file = Path(path) / _DESCRIPTION
+        if not file.is_file():
+            raise FileNotFoundError(f"{path} holds no saved buffer: {_DESCRIPTION} is missing. Save one with dumps().")
+        return json.loads(file.read_text())
+
+    def loads(self, path: str | Path) -> None:
+        """Take over both rings and the counters."""
+        counters = self.description(path)["counters"]
+        self.frames.loads(Path(path) / "frames")
+        self.transitions.loads(Path(path) / "transitions")
+        self._set_counters(counters)
+
+    def _counters(self) -> dict[str, int]:
+        return {"frames_written": self._frames_written, "shift": self._shift}
+
+    def _set_counters(self, counters: Mapping[str, int]) -> None:
+        self._frames_written, self._shift = counters["frames_written"], counters["shift"]

@@ -1,0 +1,141 @@
+"""A TorchRL replay buffer whose ring of rows can grow, be memory-mapped, and be saved without its unused room."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer, TensorDictRoundRobinWriter
+from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.data.replay_buffers.storages import Storage
+
+#: Rows that are copied at a time where all of them might not fit into memory.
+_CHUNK = 1024
+
+
+class RowStore(TensorDictReplayBuffer):
+    """Rows in a ring: where it is full, the oldest are overwritten.
+
+    ``state_dict`` and ``dumps`` hold the rows that there are and not the room for others, and ``loads`` reads no
+    pickles; TorchRL's own save the whole room. Restored rows lie where they lay, so that equal random draws find equal
+    rows.
+
+    Args:
+        capacity: rows kept.
+        folder: memory-map the rows here instead of holding them in memory. What an earlier store left here is
+            removed before the first row is written; a store that still uses it keeps its rows.
+        device: where rows in memory live.
+
+    Raises:
+        FileExistsError: on the first write, when the folder holds anything but an earlier store.
+
+    Example:
+        >>> store = RowStore(2)
+        >>> _ = store.extend(TensorDict({"x": torch.arange(3).unsqueeze(-1)}, [3]))
+        >>> store.storage[:]["x"].flatten().tolist()
+        [2, 1]
+        >>> store.grow(4)
+        >>> store.storage[:]["x"].flatten().tolist()
+        [1, 2]
+    """
+
+    def __init__(self, capacity: int, *, folder: str | Path | None = None, device: torch.device | str = "cpu") -> None:
+        self._folder = None if folder is None else Path(folder)
+        self._device = torch.device(device)
+        super().__init__(
+            storage=self._make_storage(capacity), sampler=RandomSampler(), writer=TensorDictRoundRobinWriter()
+        )
+
+    def _make_storage(self, capacity: int) -> Storage:
+        if self._folder is None:
+            return LazyTensorStorage(capacity, device=self._device)
+        return LazyMemmapStorage(capacity, scratch_dir=str(self._folder))
+
+    @property
+    def capacity(self) -> int:
+        """Rows that there is room for."""
+        return self.storage.max_size
+
+    @property
+    def cursor(self) -> int:
+        """Where the next row will be written."""
+        return self.writer.state_dict()["_cursor"]
+
+    def extend(self, rows: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
+        """Write rows ``[n]``; returns where, int64 ``[n]``."""
+        if self._folder is not None and not self.storage.initialized:
+            _remove_store(self._folder)
+        return super().extend(rows, update_priority=update_priority)
+
+    def grow(self, capacity: int) -> None:
+        """Make room for more rows: from the oldest on they lie in their order, the first one at 0."""
+        old, count, start = self.storage, len(self), self.cursor if len(self) == self.capacity else 0
+        written = self.write_count
+        self.set_storage(self._make_storage(capacity))
+        self.set_writer(TensorDictRoundRobinWriter())
+        # A memory-mapped store writes to the folder that it reads from: its old files, although removed, stay readable
+        # until the old storage is let go.
+        for begin in range(0, count, _CHUNK):
+            rows = torch.arange(begin, min(begin + _CHUNK, count), device=self._device) + start
+            self.extend(old[rows % count])
+        self.writer.load_state_dict({"_cursor": count % capacity, "_write_count": written})
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of the rows and the ring's counters, which ``torch.load(weights_only=True)`` can read."""
+        rows = self.storage[:].clone().to_dict() if len(self) else {}
+        return {"rows": rows, **self._counters()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over the rows and counters of another store."""
+        count = state_dict["count"]
+        self._restore(TensorDict(state_dict["rows"], [count]) if count else None, state_dict)
+
+    def dumps(self, path: str | Path) -> None:
+        """Write the rows and counters below the folder ``path``."""
+        path = Path(path)
+        _remove_store(path)
+        path.mkdir(parents=True, exist_ok=True)
+        if len(self):
+            self.storage[:].memmap(str(path / "rows"), copy_existing=True)
+        (path / "meta.json").write_text(json.dumps(self._counters()))
+
+    def loads(self, path: str | Path) -> None:
+        """Take over rows and counters from the folder ``path``; no pickles are read."""
+        path = Path(path)
+        counters = json.loads((path / "meta.json").read_text())
+        rows = TensorDict.load_memmap(str(path / "rows"), allow_pickle=False) if counters["count"] else None
+        self._restore(rows, counters)
+
+    def _counters(self) -> dict[str, int]:
+        return {
+            "capacity": self.capacity,
+            "count": len(self),
+            "cursor": self.cursor,
+            "write_count": self.write_count,
+        }
+
+    def _restore(self, rows: TensorDictBase | None, counters: dict[str, int]) -> None:
+        self.empty()
+        if counters["capacity"] != self.capacity:
+            self.set_storage(self._make_storage(counters["capacity"]))
+            self.set_writer(TensorDictRoundRobinWriter())
+        for start in range(0, counters["count"], _CHUNK):
+            assert rows is not None
+            self.extend(rows[start : start + _CHUNK])
+        self.writer.load_state_dict({"_cursor": counters["cursor"], "_write_count": counters["write_count"]})
+
+
+def _remove_store(folder: Path) -> None:
+    """Remove what a store has left; refuse to remove anything else."""
+    if not folder.exists() or not any(folder.iterdir()):
+        return
+    if not (folder / "meta.json").is_file():
+        raise FileExistsError(
+            f"{folder} holds files that no replay buffer has written. Choose another folder, or empty it first."
+        )
+    shutil.rmtree(folder)
