@@ -70,7 +70,7 @@ class RunLogger(Logger):
         self.experiment.add_histogram(name, data, options.get("step"))
 
     def close(self, timeout: float | None = None) -> None:
-        """Write what is left and close the files."""
+        """Write what is left, and close table and board."""
         self._csv.close()
         super().close(timeout)
 

@@ -75,7 +75,7 @@ class EpisodeSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationSettings:
-    """The episodes by which the trained agent is judged."""
+    """The episodes in which the trained agent is evaluated."""
 
     episodes: int = 20
 
@@ -131,7 +131,7 @@ class RunSettings:
         vae: equation (1).
         buffer: what is kept of episodes.
         online: how many episodes.
-        evaluation: by how many episodes the agent is judged.
+        evaluation: in how many episodes the agent is evaluated.
     """
 
     algorithm: str

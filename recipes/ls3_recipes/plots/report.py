@@ -108,9 +108,9 @@ def rows_of(runs: Sequence[Run], labels: Labels) -> list[dict[str, str]]:
             for _, figure, heading in FIGURES:
                 values = [run.summary[part][figure] for run in group if part in run.summary]
                 mean, error = mean_and_error(np.array(values)) if values else (np.nan, np.nan)
-                share = figure.endswith("rate")
+                rate = figure.endswith("rate")
                 row[f"{part} {heading}"] = (
-                    f"{100 * mean:.0f} ± {100 * error:.0f} %" if share else f"{mean:.1f} ± {error:.1f}"
+                    f"{100 * mean:.0f} ± {100 * error:.0f} %" if rate else f"{mean:.1f} ± {error:.1f}"
                 )
         total = np.array([run.curves["mean_violation"].sum() * np.diff(run.episodes, prepend=0)[0] for run in group])
         mean, error = mean_and_error(total)

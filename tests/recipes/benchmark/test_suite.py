@@ -88,7 +88,7 @@ def test_bf16_agrees_closely_and_fp32_with_itself_exactly(monkeypatch):
     plan = LS3Agent.planner
     monkeypatch.setattr(LS3Agent, "planner", lambda self, spec, **o: plan(self, spec, **(o | {"precision": "fp32"})))
     same = agreement(agent, options, spec, frames)
-    assert same["value_error"] < 1e-6  # two plans judged side by side may be summed in another order
+    assert same["value_error"] < 1e-6  # two plans scored side by side may be summed in another order
     assert same["feasibility"] == 0.0
 
 
