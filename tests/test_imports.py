@@ -16,7 +16,7 @@ MAY_IMPORT = {
     "objectives": {"_checks", "modules"},
     "layers": {"_checks", "modules"},
     "planners": {"_checks", "layers", "modules"},
-    "data": {"_checks", "modules"},
+    "data": {"_checks", "files", "modules"},
     "baselines": {"_checks", "modules", "objectives"},
     "files": set(),
     "agent": {"_checks", "files", "modules", "planners"},
