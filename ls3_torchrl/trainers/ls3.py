@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.record.loggers import Logger
 
 from ls3_torchrl.agent import LS3Agent
-from ls3_torchrl.data import ALL_TAGS, VALUE_TAGS, Tag, TaggedReplayBuffer
+from ls3_torchrl.data import VALUE_TAGS, RowSelection, Tag, TaggedReplayBuffer
 from ls3_torchrl.objectives import (
     ClassifierLoss,
     EnsembleDynamicsLoss,
@@ -105,23 +105,21 @@ class LS3Trainer:
         """Members of an ensemble that each learn from a batch of their own; ``None`` where all learn from the same."""
         return getattr(module, "num_members", None) if self.options.optim.bootstrap else None
 
-    def _sampler(self, tags: tuple = ALL_TAGS, members: int | None = None, **rows: Any) -> Callable[[], TensorDictBase]:
+    def _sampler(self, members: int | None = None, **rows: Any) -> Callable[[], TensorDictBase]:
+        """Draws batches from the ``rows`` that a :class:`~ls3_torchrl.data.RowSelection` describes."""
         batch_size = self.options.optim.batch_size
-        rows |= {"tags": tags, "online_fraction": self.options.online.fraction}
-        return lambda: self.buffer.sample(batch_size, members=members, **rows)
+        selection = RowSelection(online_fraction=self.options.online.fraction, **rows)
+        return lambda: self.buffer.sample(batch_size, selection, members=members)
 
     def _dynamics_learner(self) -> Learner:
         """Equation (2)."""
         options, dynamics = self.options, self.agent.dynamics
         horizon = options.loss.dynamics_horizon
-        rows = {
-            "without": None if self.buffer.dynamics_after_violation else "after_violation",
-            "steps": horizon if horizon > 1 else None,
-        }
         members = self._members(dynamics)
         loss = EnsembleDynamicsLoss(dynamics, bootstrap=members is not None, steps=horizon)
         loss.set_keys(action=self.buffer.keys.action)
-        sample = self._sampler(members=members, **rows)
+        without = None if self.buffer.dynamics_after_violation else "after_violation"
+        sample = self._sampler(members, without=without, steps=horizon if horizon > 1 else None)
         return Learner("dynamics", loss, sample, lr=options.optim.dynamics_lr, **self._how)
 
     def _value_learner(self) -> Learner:
@@ -135,7 +133,7 @@ class LS3Trainer:
                 options.loss.failure_weight, OfflineValueLoss(value, bootstrap=bootstrap), self._sample_failures
             )
         loss = OfflineValueLoss(value, bootstrap=bootstrap)
-        sample = self._sampler(VALUE_TAGS, members)
+        sample = self._sampler(members, tags=VALUE_TAGS)
         return Learner("value", loss, sample, lr=options.optim.lr, auxiliary=auxiliary, **self._how)
 
     def _value_td_learner(self) -> Learner:
@@ -150,7 +148,7 @@ class LS3Trainer:
             bootstrap=members is not None,
         )
         loss.set_keys(reward=self.buffer.keys.reward)
-        sample = self._sampler(VALUE_TAGS, members)
+        sample = self._sampler(members, tags=VALUE_TAGS)
         interval = options.optim.target_interval
         return Learner("value", loss, sample, lr=options.optim.lr, target_interval=interval, **self._how)
 

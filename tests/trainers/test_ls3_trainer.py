@@ -33,11 +33,11 @@ def filled(episode):
 def test_each_learner_draws_from_the_data_that_the_paper_names(make_agent):
     agent, buffer, drawn = make_agent(), TaggedReplayBuffer(100, latent_dim=8), {}
 
-    def sample(batch_size, *, tags, members=None, without=None, steps=None, online_fraction):
-        assert without is None
-        assert steps is None
-        assert online_fraction == 0.25
-        drawn[current] = ({tag.name.lower() for tag in tags}, members)
+    def sample(batch_size, selection, *, members=None):
+        assert selection.without is None
+        assert selection.steps is None
+        assert selection.online_fraction == 0.25
+        drawn[current] = ({tag.name.lower() for tag in selection.tags}, members)
         raise KeyboardInterrupt
 
     buffer.sample = sample
@@ -210,9 +210,7 @@ def test_states_under_keys_of_ones_own_train_as_pixels_do(episode, recorder):
     encoder = TensorDictModule(torch.nn.Identity(), [keys.observation], ["latent"])
     agent = LS3Agent(action_dim=2, latent_dim=3, encoder=encoder, num_values=2, num_dynamics=2)
     buffer.encode(agent.encoder)
-    options = LS3Options(
-        OfflineOptions(2, 2, 2, 2), OnlineOptions(1, 1, 1), OPTIM, LossOptions(failure_weight=0.5)
-    )
+    options = LS3Options(OfflineOptions(2, 2, 2, 2), OnlineOptions(1, 1, 1), OPTIM, LossOptions(failure_weight=0.5))
     trainer = LS3Trainer(agent, buffer, options, logger=recorder, progress=False)
     trainer.train_offline()
     trainer.update()
