@@ -26,13 +26,14 @@ from ls3_torchrl.modules import (
 from ls3_torchrl.objectives import (
     ClassifierLoss,
     EnsembleDynamicsLoss,
+    LatentLoss,
     LatentPredictionLoss,
     OfflineValueLoss,
     SafeSetLoss,
     TD1ValueLoss,
     VAELoss,
 )
-from ls3_torchrl.objectives.base import LatentLoss, with_members
+from ls3_torchrl.objectives.base import with_members
 
 B, D, A = 4, 3, 2
 SPEC = Bounded(low=-2.0, high=2.0, shape=(A,))
