@@ -21,7 +21,7 @@ def test_an_agent_learns_on_an_environment_that_this_project_does_not_own(tmp_pa
     first = demonstrated["steps_left"][demonstrated["tag"] == 0]
     assert len(lengths) == 6
     # Every episode reaches the top, sooner than the demonstrations that violated nothing, and none goes too far back.
-    assert sum(lengths[-3:]) / 3 < 0.9 * longest_steps(first)
+    assert sum(lengths[-3:]) / 3 < 0.9 * mean_length(first)
     assert not any("violation: True" in line for line in episodes)
     for block in others:
         exec(compile(block, DOCUMENT.name, "exec"), names)
@@ -30,10 +30,11 @@ def test_an_agent_learns_on_an_environment_that_this_project_does_not_own(tmp_pa
     assert names["robot"].foreign == ("encoder",)
 
 
-def longest_steps(steps_left):
-    """Mean length of the episodes whose rows say how many steps they have left."""
-    starts = [int(now) for before, now in zip([0, *steps_left[:-1].tolist()], steps_left.tolist(), strict=True) if now > before]
-    return sum(starts) / len(starts)
+def mean_length(steps_left):
+    """Mean length of the episodes whose rows, one after another, say how many steps they have left."""
+    before = [0, *steps_left[:-1].tolist()]
+    lengths = [left for last, left in zip(before, steps_left.tolist(), strict=True) if left > last]
+    return sum(lengths) / len(lengths)
 
 
 def test_training_takes_forty_lines_of_public_names():

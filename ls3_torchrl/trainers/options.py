@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from ls3_torchrl._checks import require_at_least, require_choice, require_fraction, require_positive
+from ls3_torchrl._checks import require_at_least, require_choice, require_positive, require_unit_interval
 
 Autocast = bool | Literal["auto"]
 #: What can learn from the posteriors' means instead of samples.
@@ -179,7 +179,7 @@ class OptimOptions:
         for name in ("lr", "dynamics_lr"):
             require_positive(getattr(self, name), name)
         _require_autocast(self.autocast)
-        require_fraction(self.cooldown, "cooldown")
+        require_unit_interval(self.cooldown, "cooldown")
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ class LossOptions:
     timed_out_weight: float = 1.0
 
     def __post_init__(self) -> None:
-        require_fraction(self.gamma_safe_set, "gamma_safe_set")
+        require_unit_interval(self.gamma_safe_set, "gamma_safe_set")
         require_choice(self.failure_rows, ("all", "violating"), "failure_rows")
         require_at_least(self.dynamics_horizon, 1, "dynamics_horizon")
         for name in ("failure_weight", "timed_out_weight"):
