@@ -27,7 +27,8 @@ SETTINGS = {
 register("benchmark", BenchmarkSettings)
 
 
-def test_python_blocks_run_one_after_another():
+def test_python_blocks_run_one_after_another(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # they leave files
     blocks = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     assert len(blocks) >= 2
     namespace: dict = {}
