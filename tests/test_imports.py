@@ -15,7 +15,7 @@ MAY_IMPORT = {
     "modules": {"_checks"},
     "objectives": {"_checks", "modules"},
     "planners": {"_checks", "modules"},
-    "data": {"_checks", "modules"},
+    "data": {"_checks", "files", "modules"},
     "baselines": {"_checks", "modules", "objectives"},
     "files": set(),
     "agent": {"_checks", "files", "modules", "planners"},
