@@ -11,13 +11,13 @@ ARGS ?=
 # Threads that wait must not burn the cores that others compute on.
 export OMP_WAIT_POLICY = passive
 
-.PHONY: help run test smoke lint types check lock clean
+.PHONY: help run test smoke lint types package check lock clean
 
 help:
 	@echo "make run    train LS3 on Navigation from pixels; pictures and figures land in runs/"
 	@echo "            (TASK=navigation PRESET=cpu|paper|smoke SEED=0 ARGS='key=value ...')"
 	@echo "make test   install what the tests need and run them"
-	@echo "make check  tests, lint, format, types and the smoke recipe: what CI runs"
+	@echo "make check  package, tests, lint, format, types and the smoke recipe: what CI runs"
 	@echo "make lock   write constraints.txt anew from this environment"
 
 $(VENV)/run.installed: pyproject.toml constraints.txt
@@ -46,10 +46,13 @@ types: $(VENV)/test.installed
 smoke: $(VENV)/run.installed
 	$(BIN)/python recipes/ls3.py preset=smoke
 
-check: test lint types smoke
+package:
+	PYTHON=$(PYTHON) .ci/package
+
+check: package test lint types smoke
 
 lock: $(VENV)/test.installed
 	$(BIN)/python -m pip freeze --exclude-editable > constraints.txt
 
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -41,6 +41,13 @@ def require_probability(value: float, name: str) -> float:
     return float(value)
 
 
+def require_unit_interval(value: float, name: str) -> float:
+    """Return ``value`` when it lies in [0, 1], ends included; raise ``ValueError`` otherwise."""
+    if not 0.0 <= value <= 1.0:
+        raise ValueError(f"{name} must lie in [0, 1], got {value}.")
+    return float(value)
+
+
 def require_choice(value: str, allowed: Iterable[str], name: str) -> str:
     """Return ``value`` when it is one of ``allowed``; raise ``ValueError`` otherwise."""
     options = tuple(allowed)
@@ -61,3 +68,10 @@ def require_positive(value: float, name: str) -> float:
     if not 0.0 < value < float("inf"):
         raise ValueError(f"{name} must be a finite number above 0, got {value}.")
     return value
+
+
+def require_fraction(value: float, name: str) -> float:
+    """Return ``value`` when it lies in [0, 1]; raise ``ValueError`` otherwise."""
+    if not 0.0 <= value <= 1.0:
+        raise ValueError(f"{name} must lie in [0, 1], got {value}.")
+    return float(value)

@@ -1,19 +1,22 @@
-"""LS3Agent: all of LS³'s networks together, in one file on disk."""
+"""LS3Agent: all of LS³'s networks together, in one file on disk, with what they were made for."""
 
 from __future__ import annotations
 
 import dataclasses
 import pickle
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
-from torchrl.data import TensorSpec
+from torchrl.data import Bounded, TensorSpec
 
-from ls3_torchrl._checks import require_at_least
+from ls3_torchrl._checks import require_at_least, require_choice
 from ls3_torchrl.files import save_atomically
 from ls3_torchrl.modules import (
     ConstraintEstimator,
@@ -27,12 +30,35 @@ from ls3_torchrl.modules import (
 from ls3_torchrl.planners import LatentEnv, LS3Planner
 
 FORMAT = "ls3_torchrl.agent"
-VERSION = 1
+VERSION = 2
+#: The modules of an agent that can be given from outside, in the order of the paper.
+PARTS = ("encoder", "decoder", "dynamics", "value", "safe_set", "constraint", "goal")
+_PACKAGES = ("ls3-torchrl", "torch", "torchrl", "tensordict")
 
 
 @dataclass(frozen=True)
 class AgentArchitecture:
-    """What an agent is built from; stored beside its weights. Arguments as for :class:`LS3Agent`."""
+    """The sizes and forms of an agent's networks, stored beside its weights; the paper's by default (section 1.1.1).
+
+    Args:
+        action_dim: A.
+        in_channels: C, 3 × stacked frames.
+        latent_dim: D (Table 1: 32).
+        num_dynamics: members of the dynamics ensemble.
+        num_values: members of the value ensemble.
+        dynamics_hidden: hidden layers of f_dyn.
+        value_hidden: hidden layers of V.
+        classifier_hidden: hidden layers of f_S, f_C and f_G.
+        initial_value: where the value networks' output biases start.
+        propagation: ``"ts1"`` or ``"tsinf"``; see :class:`~ls3_torchrl.modules.EnsembleDynamics`.
+        control_affine: the dynamics' change of the latent is affine in the action.
+        action_scale: unit of the actions in the dynamics, one number or one for each of A. :class:`LS3Agent` also takes
+            ``"box"``, half the range of the actions.
+        background: the decoder draws on top of a fixed image.
+
+    Raises:
+        ValueError: naming the field, what was received and what is allowed.
+    """
 
     action_dim: int
     in_channels: int = 3
@@ -48,156 +74,272 @@ class AgentArchitecture:
     action_scale: float | tuple[float, ...] = 1.0
     background: bool = False
 
+    def __post_init__(self) -> None:
+        # Plain numbers and tuples, whatever NumPy or a configuration gave: a file holds nothing else.
+        for field in dataclasses.fields(self):
+            object.__setattr__(self, field.name, _plain(getattr(self, field.name)))
+        for name in ("action_dim", "in_channels", "latent_dim", "num_dynamics", "num_values"):
+            require_at_least(getattr(self, name), 1, name)
+        for name in ("dynamics_hidden", "value_hidden", "classifier_hidden"):
+            object.__setattr__(self, name, tuple(require_at_least(size, 1, name) for size in getattr(self, name)))
+        require_choice(self.propagation, ("ts1", "tsinf"), "propagation")
+
+
+def _plain(value: Any) -> Any:
+    """Numbers and tuples of them instead of those of NumPy, PyTorch or a configuration."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    return (
+        tuple(_plain(item) for item in value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+    )
+
+
+def _one_action(spec: TensorSpec) -> Bounded:
+    """The bounds of one action, ``[A]``: of a batched spec, those of its first row."""
+    if not isinstance(spec, Bounded):
+        raise ValueError(f"Planning needs a bounded action spec, got {type(spec).__name__}.")
+    low, high = (bound.reshape(-1, spec.shape[-1])[0].cpu() for bound in (spec.space.low, spec.space.high))
+    return Bounded(low=low, high=high, shape=low.shape, dtype=spec.dtype)
+
 
 class LS3Agent(nn.Module):
-    """Encoder, decoder, dynamics, value, safe set, constraint and goal; the paper's sizes by default.
+    """Encoder, decoder, dynamics, value, safe set, constraint and goal, and the planner that acts by them.
+
+    Every module can be one of your own: any that reads and writes what the agent's own does. With an encoder of your
+    own there is no decoder unless you give one.
 
     Args:
-        action_dim: A.
-        in_channels: C, 3 × stacked frames.
-        latent_dim: D.
-        num_dynamics: members of the dynamics ensemble.
-        num_values: members of the value ensemble.
-        dynamics_hidden: hidden layers of f_dyn.
-        value_hidden: hidden layers of V.
-        classifier_hidden: hidden layers of f_S, f_C and f_G.
-        initial_value: where the value networks' output biases start.
-        propagation: ``"ts1"`` or ``"tsinf"``.
-        control_affine: the dynamics' change of the latent is affine in the action.
-        action_scale: unit of the actions in the dynamics, one number or one for each of A.
-        background: the decoder draws on top of a fixed image.
+        action_dim: A; taken from ``action_spec`` when ``None``.
+        action_spec: bounds of an action, ``[A]`` or batched, that :meth:`planner` keeps to.
+        planner: settings that :meth:`planner` uses unless others are given: the keyword arguments of
+            :class:`~ls3_torchrl.planners.LS3Planner` and :class:`~ls3_torchrl.planners.CrossEntropyMethod`.
+        task: name of what the agent is made for; kept in its file.
+        encoder: from observations to ``loc`` and ``scale``, or just ``latent``.
+        decoder: from ``latent`` to ``reco_pixels``.
+        dynamics: f_dyn.
+        value: V.
+        safe_set: f_S.
+        constraint: f_C.
+        goal: f_G.
+        architecture: sizes and forms of the modules that are not given: the fields of :class:`AgentArchitecture`.
 
     Raises:
-        ValueError: for sizes below 1 or an unknown propagation; by :meth:`load`, for a file that is no agent,
-            of another version, or of another shape.
+        ValueError: for sizes out of range, or neither ``action_dim`` nor ``action_spec``; by :meth:`load`, for a file
+            that is no agent, of another version, or of another shape.
+        TypeError: for an unknown setting.
 
     Example:
         >>> import tempfile
-        >>> from torchrl.data import Bounded
-        >>> agent = LS3Agent(action_dim=2, latent_dim=8)
-        >>> policy = agent.planner(Bounded(low=-3.0, high=3.0, shape=(2,)), num_candidates=50, num_elites=5)
+        >>> agent = LS3Agent(action_spec=Bounded(low=-3.0, high=3.0, shape=(2,)), latent_dim=8)
+        >>> policy = agent.planner(num_candidates=50, num_elites=5)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = agent.save(f"{folder}/agent.pt")
-        ...     LS3Agent.load(path).architecture.latent_dim
-        8
+        ...     LS3Agent.load(path).planner().optimizer.num_candidates
+        50
     """
+
+    # Any module that reads and writes what the agent's own does.
+    encoder: Any
+    decoder: Any
+    dynamics: Any
+    value: Any
+    safe_set: Any
+    constraint: Any
+    goal: Any
 
     def __init__(
         self,
-        action_dim: int,
+        action_dim: int | None = None,
         *,
-        in_channels: int = 3,
-        latent_dim: int = 32,
-        num_dynamics: int = 5,
-        num_values: int = 5,
-        dynamics_hidden: Sequence[int] = (128, 128),
-        value_hidden: Sequence[int] = (256, 256, 256),
-        classifier_hidden: Sequence[int] = (256, 256, 256),
-        initial_value: float = 0.0,
-        propagation: Literal["ts1", "tsinf"] = "ts1",
-        control_affine: bool = False,
-        action_scale: float | Sequence[float] = 1.0,
-        background: bool = False,
+        action_spec: TensorSpec | None = None,
+        planner: Mapping[str, Any] | None = None,
+        task: str | None = None,
+        encoder: TensorDictModuleBase | None = None,
+        decoder: TensorDictModuleBase | None = None,
+        dynamics: TensorDictModuleBase | None = None,
+        value: TensorDictModuleBase | None = None,
+        safe_set: TensorDictModuleBase | None = None,
+        constraint: TensorDictModuleBase | None = None,
+        goal: TensorDictModuleBase | None = None,
+        **architecture: Any,
     ) -> None:
         super().__init__()
-        for name, size in (
-            ("action_dim", action_dim),
-            ("in_channels", in_channels),
-            ("latent_dim", latent_dim),
-        ):
-            require_at_least(size, 1, name)
-        self.architecture = AgentArchitecture(
-            action_dim=action_dim,
-            in_channels=in_channels,
-            latent_dim=latent_dim,
-            num_dynamics=num_dynamics,
-            num_values=num_values,
-            dynamics_hidden=tuple(dynamics_hidden),
-            value_hidden=tuple(value_hidden),
-            classifier_hidden=tuple(classifier_hidden),
-            initial_value=initial_value,
-            propagation=propagation,
-            control_affine=control_affine,
-            action_scale=tuple(action_scale) if isinstance(action_scale, Sequence) else action_scale,
-            background=background,
-        )
-        self.encoder = PixelEncoder(in_channels, latent_dim)
-        self.decoder = PixelDecoder(in_channels, latent_dim, background=background)
-        self.dynamics = EnsembleDynamics(
-            latent_dim,
-            action_dim,
-            num_members=num_dynamics,
-            hidden=dynamics_hidden,
-            propagation=propagation,
-            control_affine=control_affine,
-            action_scale=action_scale,
-        )
-        self.value = ValueEnsemble(latent_dim, num_members=num_values, hidden=value_hidden, initial_value=initial_value)
-        self.safe_set = SafeSet(latent_dim, hidden=classifier_hidden)
-        self.constraint = ConstraintEstimator(latent_dim, hidden=classifier_hidden)
-        self.goal = GoalEstimator(latent_dim, hidden=classifier_hidden)
+        self.action_spec = None if action_spec is None else _one_action(action_spec)
+        if action_dim is None:
+            if self.action_spec is None:
+                raise ValueError("LS3Agent needs action_dim, or an action_spec that it can be read from; got neither.")
+            action_dim = self.action_spec.shape[-1]
+        self.planner_settings = dict(planner or {})
+        self.task = task
+        if isinstance(architecture.get("action_scale"), str):
+            architecture["action_scale"] = self._half_range(architecture["action_scale"])
+        self.architecture = shape = AgentArchitecture(action_dim, **architecture)
+        given = dict(zip(PARTS, (encoder, decoder, dynamics, value, safe_set, constraint, goal), strict=True))
+        #: Names of the modules that were given from outside.
+        self.foreign = tuple(name for name, module in given.items() if module is not None)
+        if encoder is None:
+            encoder = PixelEncoder(shape.in_channels, shape.latent_dim)
+            if decoder is None:
+                decoder = PixelDecoder(shape.in_channels, shape.latent_dim, background=shape.background)
+        self.encoder, self.decoder = encoder, decoder
+        self.dynamics = self._make_dynamics() if dynamics is None else dynamics
+        self.value = self._make_value() if value is None else value
+        size, hidden = shape.latent_dim, shape.classifier_hidden
+        self.safe_set = SafeSet(size, hidden=hidden) if safe_set is None else safe_set
+        self.constraint = ConstraintEstimator(size, hidden=hidden) if constraint is None else constraint
+        self.goal = GoalEstimator(size, hidden=hidden) if goal is None else goal
 
-    def planner(self, action_spec: TensorSpec, **options: Any) -> LS3Planner:
-        """The policy: an :class:`~ls3_torchrl.planners.LS3Planner` over this agent's networks.
+    def _half_range(self, word: str) -> list[float]:
+        """What ``action_scale="box"`` stands for: half the actions' range."""
+        require_choice(word, ("box",), "action_scale, where it is a word,")
+        if self.action_spec is None:
+            raise ValueError("action_scale='box' needs the actions' bounds: pass action_spec=env.action_spec.")
+        space = self.action_spec.space
+        return ((space.high - space.low) / 2).tolist()
+
+    def _make_dynamics(self) -> EnsembleDynamics:
+        shape = self.architecture
+        return EnsembleDynamics(
+            shape.latent_dim,
+            shape.action_dim,
+            num_members=shape.num_dynamics,
+            hidden=shape.dynamics_hidden,
+            propagation=shape.propagation,
+            control_affine=shape.control_affine,
+            action_scale=shape.action_scale,
+        )
+
+    def _make_value(self) -> ValueEnsemble:
+        shape = self.architecture
+        return ValueEnsemble(
+            shape.latent_dim,
+            num_members=shape.num_values,
+            hidden=shape.value_hidden,
+            initial_value=shape.initial_value,
+        )
+
+    def planner(self, action_spec: TensorSpec | None = None, **settings: Any) -> LS3Planner:
+        """The policy: an :class:`~ls3_torchrl.planners.LS3Planner` over this agent's modules.
+
+        Bounds and settings are remembered: a file written afterwards holds them, and its agent plans alike.
 
         Args:
-            action_spec: bounds of one action, shape ``[A]``; a batched spec's first row is taken.
-            options: passed on to the planner.
+            action_spec: bounds of one action, shape ``[A]``; a batched spec's first row is taken. Those that the agent
+                was made for when ``None``.
+            settings: of the planner and its optimiser, in place of those that the agent was made for.
+
+        Raises:
+            ValueError: when no bounds are known, or for settings out of range.
+            TypeError: for an unknown setting.
         """
-        while len(action_spec.shape) > 1:
-            action_spec = action_spec[0]
+        if action_spec is not None:
+            self.action_spec = _one_action(action_spec)
+        if self.action_spec is None:
+            raise ValueError("The bounds of the actions are not known: pass planner(action_spec=env.action_spec).")
+        self.planner_settings |= settings
         device = next(self.parameters()).device
-        env = LatentEnv(self.dynamics, self.constraint, self.goal, action_spec=action_spec, device=device)
-        return LS3Planner(env, self.value, self.safe_set, self.encoder, **options)
+        model = LatentEnv(self.dynamics, self.constraint, self.goal, action_spec=self.action_spec, device=device)
+        return LS3Planner(model, self.value, self.safe_set, self.encoder, **self.planner_settings)
 
     def save(self, path: str | Path) -> Path:
-        """Write architecture and weights to one file; a half-written file never takes its place."""
+        """Write weights and all that the agent was made for to one file; a half-written file never takes its place."""
+        spec = self.action_spec
         content = {
             "format": FORMAT,
             "version": VERSION,
             "architecture": dataclasses.asdict(self.architecture),
+            "foreign": list(self.foreign),
+            "action_spec": None if spec is None else {"low": spec.space.low.cpu(), "high": spec.space.high.cpu()},
+            "planner": {name: _plain(value) for name, value in self.planner_settings.items()},
+            "task": self.task,
+            "versions": _versions(),
             "state_dict": self.state_dict(),
         }
         return save_atomically(content, path)
 
     @classmethod
-    def load(cls, path: str | Path, *, device: torch.device | str = "cpu", **expected: Any) -> LS3Agent:
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        device: torch.device | str = "cpu",
+        modules: Mapping[str, TensorDictModuleBase] | None = None,
+        **expected: Any,
+    ) -> LS3Agent:
         """Read an agent written by :meth:`save`.
 
         Args:
             path: the file.
             device: where its parameters go.
-            expected: arguments of the constructor that the file must agree with, e.g. ``action_dim=2``.
+            modules: the modules by name that the agent was given from outside; the file's weights are loaded into them.
+            expected: fields of the architecture that the file must agree with, e.g. ``action_dim=2``.
         """
         path = Path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"There is no agent at {path}.")
-        advice = f"{path} is not an agent file ({FORMAT}), or is damaged. Pass a file written by LS3Agent.save()."
-        try:
-            content = torch.load(path, map_location="cpu", weights_only=True)
-        except (EOFError, RuntimeError, pickle.UnpicklingError) as error:
-            raise ValueError(advice) from error
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ValueError(advice)
-        if content.get("version") != VERSION:
+        content = _read(path)
+        given = dict(modules or {})
+        foreign = set(content.get("foreign", ()))
+        if foreign != set(given):
             raise ValueError(
-                f"{path} has version {content.get('version')}, but this library reads version {VERSION}. "
-                "Train again, or install the library version that wrote it."
+                f"{path} holds an agent whose {', '.join(sorted(foreign)) or 'modules'} "
+                f"{'were given from outside' if foreign else 'are all its own'}; received modules for "
+                f"{', '.join(sorted(given)) or 'none'}. Pass modules={{name: module}} for just those from outside."
             )
-        architecture = content["architecture"]
-        # Configurations have lists where the file has tuples.
-        wanted = {
-            name: tuple(v) if isinstance(v, Sequence) and not isinstance(v, str) else v for name, v in expected.items()
-        }
-        differing = {
-            name: (architecture.get(name), value) for name, value in wanted.items() if architecture.get(name) != value
-        }
-        if differing:
-            words = ", ".join(f"{name} {there} instead of {other}" for name, (there, other) in differing.items())
-            raise ValueError(f"{path} holds an agent of another shape: {words}. Choose a matching checkpoint.")
-        agent = cls(**architecture).to(device)
+        _check_shape(path, content["architecture"], expected)
+        bounds = content.get("action_spec")
+        agent = cls(
+            **content["architecture"],
+            **given,
+            action_spec=None if bounds is None else Bounded(**bounds, shape=bounds["low"].shape),
+            planner=content.get("planner"),
+            task=content.get("task"),
+        ).to(device)
         try:
             agent.load_state_dict(content["state_dict"])
         except RuntimeError as error:
             raise ValueError(f"{path} does not fit its own architecture; the file is damaged: {error}") from error
         return agent
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # used from a checkout that is not installed
+            found[name] = "unknown"
+    return found
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The content of an agent file of this version or the one before."""
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no agent at {path}.")
+    advice = f"{path} is not an agent file ({FORMAT}), or is damaged. Pass a file written by LS3Agent.save()."
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (EOFError, RuntimeError, pickle.UnpicklingError) as error:
+        raise ValueError(advice) from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(advice)
+    if content.get("version") == 1:
+        warnings.warn(
+            f"{path} is an agent file of version 1, which keeps neither bounds nor planner settings: pass them to "
+            f"planner(), or it plans with the paper's. Save it again to have a file of version {VERSION}.",
+            stacklevel=3,
+        )
+    elif content.get("version") != VERSION:
+        raise ValueError(
+            f"{path} has version {content.get('version')}, but this library reads versions 1 and {VERSION}. "
+            "Train again, or install the library version that wrote it."
+        )
+    return content
+
+
+def _check_shape(path: Path, architecture: dict[str, Any], expected: dict[str, Any]) -> None:
+    wanted = {name: _plain(value) for name, value in expected.items()}
+    there = {name: architecture.get(name) for name in wanted}
+    differing = [f"{name} {there[name]} instead of {other}" for name, other in wanted.items() if there[name] != other]
+    if differing:
+        raise ValueError(
+            f"{path} holds an agent of another shape: {', '.join(differing)}. Choose a matching checkpoint."
+        )

@@ -1,18 +1,6 @@
-"""Behaviour cloning end to end."""
+"""Behaviour cloning end to end: ``ls3 train algorithm=bc`` from a clone."""
 
-from __future__ import annotations
-
-import hydra
-from omegaconf import DictConfig
-
-from comparisons import train
-
-
-@hydra.main(version_base="1.3", config_path="conf", config_name="bc")
-def main(config: DictConfig) -> None:
-    """Entry point."""
-    train(config)
-
+from ls3_recipes.commands.train import main
 
 if __name__ == "__main__":
-    main()
+    main(algorithm="bc")

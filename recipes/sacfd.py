@@ -1,18 +1,6 @@
-"""SACfD and, with recovery=true, SACfD+RRL end to end."""
+"""SACfD and, with recovery=true, SACfD+RRL end to end: ``ls3 train algorithm=sacfd`` from a clone."""
 
-from __future__ import annotations
-
-import hydra
-from omegaconf import DictConfig
-
-from comparisons import train
-
-
-@hydra.main(version_base="1.3", config_path="conf", config_name="sacfd")
-def main(config: DictConfig) -> None:
-    """Entry point."""
-    train(config)
-
+from ls3_recipes.commands.train import main
 
 if __name__ == "__main__":
-    main()
+    main(algorithm="sacfd")

@@ -1,6 +1,8 @@
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded
 
 from ls3_torchrl import LS3Agent
@@ -112,7 +114,7 @@ def test_another_shape_than_expected_is_refused(tmp_path, expected, message):
 def test_another_version_is_refused(tmp_path):
     path = tiny().save(tmp_path / "agent.pt")
     change(path, version=99)
-    with pytest.raises(ValueError, match="has version 99, but this library reads version 1"):
+    with pytest.raises(ValueError, match="has version 99, but this library reads versions 1 and 2"):
         LS3Agent.load(path)
 
 
@@ -196,3 +198,123 @@ def test_options_of_the_planner_are_passed_on():
     assert planner.safe_set_threshold == 0.5
     with pytest.raises(TypeError, match="depth"):
         tiny().planner(spec, depth=3)
+
+
+SPEC = Bounded(low=torch.tensor([-1.0, 0.5]), high=torch.tensor([0.0, 2.0]), shape=(2,))
+
+
+def acts(planner):
+    """What a planner does from three images, under one seed."""
+    torch.manual_seed(11)
+    pixels = torch.randint(256, (3, 3, 64, 64), dtype=torch.uint8)
+    return planner(TensorDict({"pixels": pixels}, [3]))["action"]
+
+
+def test_a_loaded_agent_plans_as_it_did_in_its_run(tmp_path):
+    agent = tiny()
+    action = acts(agent.planner(SPEC, **(OPTIONS | {"safe_set_threshold": 0.5, "pessimism": 1.0})))
+    loaded = LS3Agent.load(agent.save(tmp_path / "agent.pt"))
+    planner = loaded.planner()
+    assert (planner.horizon, planner.optimizer.num_candidates, planner.safe_set_threshold) == (2, 20, 0.5)
+    assert torch.equal(planner.action_spec.space.low, SPEC.space.low)
+    assert torch.equal(acts(planner), action)
+    # A setting of one's own goes before what the file holds, and the others stay.
+    assert loaded.planner(horizon=3).horizon == 3
+    assert loaded.planner().optimizer.num_candidates == 20
+
+
+def test_an_agent_made_for_a_task_keeps_its_bounds_settings_and_name(tmp_path):
+    agent = LS3Agent(action_spec=SPEC.expand(4, 2), planner=OPTIONS, task="reacher", **TINY)
+    path = agent.save(tmp_path / "agent.pt")
+    loaded = LS3Agent.load(path)
+    assert (loaded.architecture.action_dim, loaded.task) == (2, "reacher")
+    assert loaded.planner().horizon == OPTIONS["horizon"]
+    versions = torch.load(path, weights_only=True)["versions"]
+    assert versions["torch"] == torch.__version__.split("+")[0] or versions["torch"] == torch.__version__
+
+
+def test_without_bounds_there_is_no_planner():
+    with pytest.raises(ValueError, match=r"action_spec=env\.action_spec"):
+        tiny().planner()
+    with pytest.raises(ValueError, match="action_dim, or an action_spec"):
+        LS3Agent()
+
+
+def test_a_file_of_version_one_is_read_with_a_warning(tmp_path):
+    agent = tiny()
+    path = agent.save(tmp_path / "agent.pt")
+    content = torch.load(path, weights_only=True)
+    old = {key: content[key] for key in ("format", "architecture", "state_dict")}
+    torch.save(old | {"version": 1}, path)
+    with pytest.warns(UserWarning, match="version 1, which keeps neither bounds nor planner settings"):
+        loaded = LS3Agent.load(path)
+    assert torch.equal(outputs(loaded)["loc"], outputs(agent)["loc"])
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        {"action_scale": np.array([3.0, 1.0])},
+        {"action_scale": np.float64(3.0)},
+        {"latent_dim": np.int64(4)},
+        {"value_hidden": np.array([8, 8])},
+        {"initial_value": torch.tensor(-3.0)},
+    ],
+)
+def test_numbers_of_numpy_and_torch_can_be_saved_and_read(tmp_path, numbers):
+    agent = tiny(**numbers)
+    loaded = LS3Agent.load(agent.save(tmp_path / "agent.pt"))
+    assert loaded.architecture == agent.architecture
+    planner = agent.planner(SPEC, **(OPTIONS | {"horizon": np.int64(3), "pessimism": np.float32(0.5)}))
+    assert LS3Agent.load(agent.save(tmp_path / "agent.pt")).planner().horizon == planner.horizon
+
+
+def test_box_is_half_the_range_of_each_action():
+    low, high = torch.tensor([-3.0, 0.0]), torch.tensor([1.0, 0.02])
+    for batch in ((), (4,)):
+        spec = Bounded(low=low.expand(*batch, 2), high=high.expand(*batch, 2), shape=(*batch, 2))
+        agent = LS3Agent(action_spec=spec, **TINY, action_scale="box")
+        assert agent.architecture.action_scale == pytest.approx((2.0, 0.01))
+    with pytest.raises(ValueError, match="needs the actions' bounds"):
+        tiny(action_scale="box")
+    with pytest.raises(ValueError, match="action_scale"):
+        LS3Agent(action_spec=spec, **TINY, action_scale="range")
+
+
+def reader():
+    return TensorDictModule(torch.nn.Linear(10, 4), ["sensors"], ["latent"])
+
+
+def test_an_encoder_of_ones_own_takes_the_place_of_the_agents(tmp_path):
+    agent = tiny(encoder=reader())
+    assert agent.decoder is None
+    assert agent.foreign == ("encoder",)
+    planner = agent.planner(SPEC, **OPTIONS)
+    action = planner(TensorDict({"sensors": torch.zeros(3, 10)}, [3]))["action"]
+    assert action.shape == (3, 2)
+    path = agent.save(tmp_path / "agent.pt")
+    other = reader()
+    loaded = LS3Agent.load(path, modules={"encoder": other})
+    assert loaded.encoder is other
+    assert torch.equal(other.module.weight, agent.encoder.module.weight)
+    with pytest.raises(ValueError, match=r"whose encoder were given from outside; received modules for none"):
+        LS3Agent.load(path)
+
+
+def test_modules_for_an_agent_that_has_its_own_are_refused(tmp_path):
+    path = tiny().save(tmp_path / "agent.pt")
+    with pytest.raises(ValueError, match="are all its own; received modules for encoder"):
+        LS3Agent.load(path, modules={"encoder": reader()})
+
+
+def test_every_module_can_be_given():
+    parts = tiny(1)
+    given = {name: getattr(parts, name) for name in NETWORKS}
+    agent = tiny(0, **given)
+    assert agent.foreign == NETWORKS
+    assert all(getattr(agent, name) is module for name, module in given.items())
+
+
+def test_unknown_settings_of_the_architecture_are_refused():
+    with pytest.raises(TypeError, match="latent_size"):
+        LS3Agent(2, latent_size=3)

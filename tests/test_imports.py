@@ -7,18 +7,20 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LIBRARY, ENVIRONMENTS = ROOT / "ls3_torchrl", ROOT / "envs" / "ls3_envs"
-RECIPES = {path.stem for path in (ROOT / "recipes").glob("*.py")}
+RECIPES = {"ls3_recipes"} | {path.stem for path in (ROOT / "recipes").glob("*.py")}
 
 # What each part of the library may import of it, besides itself.
 MAY_IMPORT = {
     "_checks": set(),
     "modules": {"_checks"},
     "objectives": {"_checks", "modules"},
-    "planners": {"_checks", "modules"},
+    "layers": {"_checks", "modules"},
+    "planners": {"_checks", "layers", "modules"},
     "data": {"_checks", "files", "modules"},
     "baselines": {"_checks", "modules", "objectives"},
     "files": set(),
     "agent": {"_checks", "files", "modules", "planners"},
+    "trainers": {"_checks", "agent", "data", "layers", "modules", "objectives"},
     "__init__": {"agent"},
 }
 

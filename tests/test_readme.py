@@ -1,14 +1,30 @@
-"""The README's promises: its Python runs, and its commands name files and settings that exist."""
+"""The documents' promises: their Python runs, and their commands name files and settings that exist."""
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+
+from ls3_recipes.algorithms import ALGORITHMS
+from ls3_recipes.benchmark.suite import BenchmarkSettings
+from ls3_recipes.commands.collect import CollectSettings
+from ls3_recipes.commands.evaluate import EvaluateSettings
+from ls3_recipes.commands.report import ReportSettings
+from ls3_recipes.configuration import compose_settings, register, settings_class_of, train_settings
+from ls3_recipes.options import as_dict
+from ls3_recipes.renamed import RENAMED
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+SETTINGS = {
+    "collect": CollectSettings,
+    "evaluate": EvaluateSettings,
+    "report": ReportSettings,
+    "benchmark": BenchmarkSettings,
+}
+register("benchmark", BenchmarkSettings)
 
 
 def test_python_blocks_run_one_after_another():
@@ -28,33 +44,71 @@ def test_the_python_of_the_other_documents_runs_by_itself():
         exec(compile(block, "comparisons.md", "exec"), {})
 
 
-@pytest.mark.parametrize("line", re.findall(r"^python recipes/.*$", README, flags=re.MULTILINE))
+def commands():
+    """What the documents tell to type: ``ls3 COMMAND …`` and ``python recipes/DOOR.py …``, in blocks of shell."""
+    for document in DOCUMENTS:
+        for block in re.findall(r"```(?:bash|sh|console)?\n(.*?)```", document.read_text(), flags=re.DOTALL):
+            whole = re.sub(r"\\\n\s*", "", block)
+            yield from re.findall(r"^(?:\$ )?((?:ls3 |python recipes/)[^\n]*)$", whole, flags=re.MULTILINE)
+
+
+def test_there_are_commands_to_check():
+    assert len(list(commands())) >= 4
+
+
+@pytest.mark.parametrize("line", sorted(set(commands())))
 def test_commands_compose(line):
-    _, script, *overrides = line.split("#")[0].split()
-    assert (ROOT / script).is_file()
-    with initialize_config_dir(str(ROOT / "recipes" / "conf"), version_base="1.3"):
-        compose(Path(script).stem, overrides)
+    words = [word.strip("\"'") for word in line.split("#")[0].split()]
+    if words[0] == "python":
+        door = ROOT / words[1]
+        assert door.is_file()
+        name, overrides = door.stem, words[2:]
+        command = "train" if name in ALGORITHMS else name
+        overrides = [f"algorithm={name}", *overrides] if command == "train" else overrides
+    else:
+        command, overrides = words[1], words[2:]
+    # The files of runs that the reader will have are not there.
+    overrides = [re.sub(r"^(vae\.checkpoint)=.*", rf"\1={ROOT / 'README.md'}", override) for override in overrides]
+    if command == "train":
+        compose_settings("train", settings_class_of(overrides), overrides)
+    elif command in SETTINGS:
+        compose_settings(command, SETTINGS[command], overrides)
+    else:
+        assert command in ("gallery", "--help")
 
 
 def test_make_targets_exist():
     makefile = (ROOT / "Makefile").read_text()
-    for target in re.findall(r"make (\w+)", README):
+    for target in re.findall(r"`?make (\w+)", README):
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
 
 
-@pytest.mark.parametrize("name", ["docs/deviations.md", "docs/learning.md", "README.md"])
-def test_settings_that_the_documents_name_exist(name):
-    with initialize_config_dir(str(ROOT / "recipes" / "conf"), version_base="1.3"):
-        config = compose("ls3", [])
-    groups = "agent|vae|offline|online|optim|loss|planner|evaluation"
-    named = re.findall(rf"`(?:[^`]* )?((?:{groups})\.[a-z_]+)", (ROOT / name).read_text())
-    named = [key for key in named if key.split(".")[1] not in ("pt", "py", "gif")]
-    missing = {key for key in named if OmegaConf.select(config, key, default=...) is ...}
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_settings_that_the_documents_name_exist_and_by_their_present_names(document):
+    parts = [as_dict(train_settings(f"algorithm={algorithm}")) for algorithm in ("ls3", "sacfd", "awac")]
+    sections = {key for part in parts for key, value in part.items() if isinstance(value, dict)}
+    known = {f"{section}.{name}" for part in parts for section in sections & set(part) for name in part[section]}
+    known |= {f"agent.{ending}" for ending in ("pt", "py")} | {"evaluation.gif"}
+    text = document.read_text()
+    named = re.findall(rf"`(?:[^`]* )?((?:{'|'.join(sections)})\.[a-z_]+\b)(?!\()", text)
+    missing = set(named) - known
     assert not missing
+    assert not [old for old in RENAMED if re.search(rf"(?<![\w.]){re.escape(old)}(?![\w.])", text)]
 
 
 def test_files_that_the_documents_link_to_exist():
-    documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
-    for document in documents:
+    for document in DOCUMENTS:
         for link in re.findall(r"\]\((?!http)([^)#]+)\)", document.read_text()):
             assert (document.parent / link).exists(), f"{document.name}: {link}"
+
+
+def test_the_description_for_package_indexes_has_no_relative_link(monkeypatch):
+    made: dict = {}
+    monkeypatch.setattr("setuptools.setup", lambda **options: made.update(options))
+    runpy.run_path(str(ROOT / "setup.py"))
+    described = made["long_description"]
+    assert made["long_description_content_type"] == "text/markdown"
+    assert described.count("](") == README.count("](")
+    assert not re.findall(r"\]\((?!https?:|#)", described)
+    for picture in re.findall(r"!\[[^\]]*\]\(([^)]*)\)", described):
+        assert picture.startswith("https://raw.githubusercontent.com/")

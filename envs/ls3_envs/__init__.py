@@ -1,50 +1,53 @@
-"""Visual domains with constraints, as batched TorchRL environments and as Gymnasium environments."""
+"""Visual domains with constraints, as batched TorchRL environments and as Gymnasium environments.
+
+The environments and demonstrators of the table (``ls3_envs.ReacherEnv``, ``ls3_envs.ReacherDemonstrator``, …) are
+imported when they are first asked for: importing this package needs no MuJoCo.
+"""
+
+from typing import Any
 
 from ls3_envs.base import VisualConstraintEnv
-from ls3_envs.cable_routing import CableRoutingEnv
-from ls3_envs.demonstrators import (
-    CableDemonstrator,
-    CableViolator,
-    CableWanderer,
-    NavigationDemonstrator,
-    NavigationViolator,
-    PushingDemonstrator,
-    PushingViolator,
-    ReacherDemonstrator,
-    ReacherViolator,
-    ReacherWanderer,
+from ls3_envs.gym import GymEnv, GymVectorEnv
+from ls3_envs.lazy import Lazy
+from ls3_envs.plane import Circle, Plane, Rectangle
+from ls3_envs.registry import (
+    DOMAINS,
+    Domain,
+    OfflineData,
+    collect_offline,
+    domain,
+    lazy_classes,
+    make,
+    register,
+    unregister,
 )
-from ls3_envs.gym import GymEnv, GymVectorEnv, register_gymnasium
-from ls3_envs.navigation import NavigationEnv
-from ls3_envs.pushing import SequentialPushingEnv
-from ls3_envs.reacher import ReacherEnv
-from ls3_envs.registry import DOMAINS, Domain, OfflineData, collect_offline, domain, make
 
 __all__ = [
     "DOMAINS",
-    "CableDemonstrator",
-    "CableRoutingEnv",
-    "CableViolator",
-    "CableWanderer",
+    "Circle",
     "Domain",
     "GymEnv",
     "GymVectorEnv",
-    "NavigationDemonstrator",
-    "NavigationEnv",
-    "NavigationViolator",
+    "Lazy",
     "OfflineData",
-    "PushingDemonstrator",
-    "PushingViolator",
-    "ReacherDemonstrator",
-    "ReacherEnv",
-    "ReacherViolator",
-    "ReacherWanderer",
-    "SequentialPushingEnv",
+    "Plane",
+    "Rectangle",
     "VisualConstraintEnv",
     "collect_offline",
     "domain",
     "make",
-    "register_gymnasium",
+    "register",
+    "unregister",
 ]
 
-register_gymnasium()
+
+def __getattr__(name: str) -> Any:
+    """The environments and demonstrators that the table of domains names."""
+    classes = lazy_classes()
+    if name not in classes:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return classes[name].load()
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *lazy_classes()})

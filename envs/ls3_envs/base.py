@@ -12,35 +12,40 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from ls3_envs.plane import Plane
+
 #: How far outside the box an action may lie before it counts as a mistake: rounding, no more.
 _ACTION_TOLERANCE = 1e-4
 
 
 class VisualConstraintEnv(EnvBase):
-    """N worlds stepped together; each shows an image and may violate a constraint.
+    """N copies of a domain stepped together; each shows an image and may violate a constraint.
 
     Every step returns the key set that the agents rely on: ``pixels`` (uint8 ``[N, 3, 64, 64]``), ``state``
     (the domain's low-dimensional state, for pictures and scripted demonstrators, never for the agent),
     ``reward`` (−1 outside the goal set, 0 in it), ``constraint`` and ``success`` (bool ``[N, 1]``).
 
     Episodes always run to the horizon and end by truncation; ``terminated`` is never set. A violation freezes
-    the world for the rest of the episode, as in the supplement, section 1.1.2.
+    its environment for the rest of the episode, as in the supplement, section 1.1.2.
 
-    Rows are independent: world ``i`` under seed ``s`` lives the same life whatever ``num_envs`` is.
+    Rows are independent: environment ``i`` under seed ``s`` goes the same way whatever ``num_envs`` is.
+
+    A domain defines five methods: ``_initial_state``, ``_advance``, ``_render``, ``_violates`` and ``_succeeds``; one
+    whose states are points of a plane also :meth:`plane` and :meth:`advance_noiseless`, which pictures use.
 
     Args:
-        num_envs: how many worlds N are stepped in one call; at least 1.
+        num_envs: how many environments N are stepped in one call; at least 1.
         state_dim: size of the low-dimensional state.
         action_low: smallest action per axis, in the domain's own units.
         action_high: largest action per axis.
         horizon: steps in an episode, at least 1.
         image_size: side of the square image in pixels.
         device: where states and images live.
-        seed: seed of the worlds' random streams; drawn from torch's global generator when ``None``.
+        seed: seed of the environments' random streams; drawn from torch's global generator when ``None``.
 
     Raises:
-        ValueError: for fewer than one world or step; by ``step`` for an action of another shape, outside the box or
-            not finite.
+        ValueError: for fewer than one environment or step; by ``step`` for an action of another shape, outside the box
+            or not finite.
         RuntimeError: by ``step`` before the first ``reset``.
     """
 
@@ -103,12 +108,12 @@ class VisualConstraintEnv(EnvBase):
         self.set_seed(int(torch.randint(2**31 - 1, ())) if seed is None else seed)
 
     @abstractmethod
-    def _initial_state(self, world: int, generator: np.random.Generator) -> Tensor:
-        """First state of one world, ``[state_dim]``; may also draw what the episode needs."""
+    def _initial_state(self, index: int, generator: np.random.Generator) -> Tensor:
+        """First state ``[state_dim]`` of the environment ``index``; may also sample what the episode needs."""
 
     @abstractmethod
     def _advance(self, state: Tensor, action: Tensor) -> Tensor:
-        """States one step on, ``[N, state_dim]``; the base keeps frozen worlds where they are."""
+        """States one step on, ``[N, state_dim]``; the base keeps frozen environments where they are."""
 
     @abstractmethod
     def _render(self, state: Tensor) -> Tensor:
@@ -127,31 +132,53 @@ class VisualConstraintEnv(EnvBase):
         return self._render(state.to(self.device))
 
     def render_rgb(self) -> Tensor:
-        """The worlds as they are now, in colour, uint8 ``[N, 3, image_size, image_size]``, whatever the agent sees."""
+        """All as they are now, in colour, uint8 ``[N, 3, image_size, image_size]``, whatever the agent sees.
+
+        A domain whose observation is not a colour picture overrides it.
+        """
         return self._render(self._state)
 
-    def plane(self, points: int = 60) -> tuple[Tensor, tuple[float, float, float, float]] | None:
-        """A grid of states to draw maps over, where the domain is a plane; ``None`` where it is not.
+    def plane(self, points: int = 60) -> Plane | None:
+        """The plane that maps and paths are drawn on, with its walls and goals; ``None`` where there is none.
+
+        A domain that has one also defines :meth:`advance_noiseless`.
 
         Args:
             points: grid points along the longer side.
-
-        Returns:
-            States ``[rows, columns, state_dim]`` and the picture's (left, right, bottom, top).
         """
         return None
+
+    def advance_noiseless(self, state: Tensor, action: Tensor) -> Tensor:
+        """Where any states get to by one step without noise, for pictures of plans.
+
+        What the environments do now plays no part and does not change; violations freeze nothing here.
+
+        Args:
+            state: ``[*B, state_dim]``.
+            action: in the domain's units, ``[*B, A]``, on the states' device.
+
+        Returns:
+            States ``[*B, state_dim]``.
+
+        Raises:
+            NotImplementedError: where the domain does not define it.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} does not say how its states move without noise. "
+            "A domain that has a plane() defines advance_noiseless(state, action), too."
+        )
 
     def _set_seed(self, seed: int | None) -> None:
         entropy = 0 if seed is None else int(seed)
         self._generators = [
-            np.random.default_rng(np.random.SeedSequence([entropy, world])) for world in range(self.num_envs)
+            np.random.default_rng(np.random.SeedSequence([entropy, index])) for index in range(self.num_envs)
         ]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = torch.arange(self.num_envs) if mask is None else mask.reshape(self.num_envs).nonzero().flatten().cpu()
-        for world in rows.tolist():
-            self._state[world] = self._initial_state(world, self._generators[world]).to(self._state)
+        for index in rows.tolist():
+            self._state[index] = self._initial_state(index, self._generators[index]).to(self._state)
         self._started = True
         self._clock[rows] = 0
         self._frozen[rows] = self._violates(self._state)[rows]
@@ -174,7 +201,8 @@ class VisualConstraintEnv(EnvBase):
         space = self.action_spec.space
         if action.shape != space.low.shape:
             raise ValueError(
-                f"An action must have shape {list(space.low.shape)}, one row for each world; got {list(action.shape)}."
+                f"An action must have shape {list(space.low.shape)}, one row for each environment; "
+                f"got {list(action.shape)}."
             )
         excess = torch.maximum(space.low - action, action - space.high).amax()
         if not excess <= _ACTION_TOLERANCE:  # also catches NaN

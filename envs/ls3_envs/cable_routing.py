@@ -92,9 +92,9 @@ class CableRoutingEnv(MujocoEnv):
         image_size: side of the image in pixels.
         physics: ``"mujoco"``, or ``"warp"`` for a GPU.
         renderer: ``"raytrace"``, or ``"egl"``.
-        threads: that share the worlds' physics; the machine's cores when ``None``.
+        threads: that share the physics; the machine's cores when ``None``.
         device: of states and pictures.
-        seed: of the worlds' random streams.
+        seed: of the environments' random streams.
 
     Returns:
         From ``step``: the keys of :class:`~ls3_envs.mujoco.MujocoEnv`; ``state`` holds the grasped end's place, the
@@ -142,13 +142,13 @@ class CableRoutingEnv(MujocoEnv):
         links = [i for i in range(self.model.ngeom) if self.model.geom(i).name.startswith("link")]
         self._links = torch.tensor(links, device=self.device)
         self._ramp = (torch.arange(1, SUBSTEPS + 1, dtype=torch.float64, device=self.device) / SUBSTEPS)[:, None]
-        # What lies under the cable never moves: drawn once, with the cable far outside the picture.
+        # What lies under the cable never moves: rendered once, with the cable far outside the picture.
         away = torch.zeros(1, self.model.nq, dtype=torch.float64, device=self.device)
         away[0, :2] = 10.0
         empty = self.renderer(away).pixels[0]
         self._goal_mask, self._obstacle_mask = is_green(empty), is_blue(empty)
 
-    def _initial_state(self, world: int, generator: np.random.Generator) -> Tensor:
+    def _initial_state(self, index: int, generator: np.random.Generator) -> Tensor:
         state = torch.zeros(self.model.nq + self.model.nv, dtype=torch.float64)
         state[:2] = torch.as_tensor(generator.normal(START, START_STD))
         return state
@@ -162,7 +162,7 @@ class CableRoutingEnv(MujocoEnv):
         return view.pixels if self.observation == "rgb" else self._segment(view)
 
     def render_rgb(self) -> Tensor:
-        """The worlds as they are now, in colour."""
+        """All as they are now, in colour."""
         return self._view(self._state).pixels
 
     def _segment(self, view: View) -> Tensor:

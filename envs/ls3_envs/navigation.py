@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ls3_envs.base import VisualConstraintEnv
+from ls3_envs.plane import Circle, Plane, Rectangle
 
 WINDOW = (180.0, 150.0)
 START = (30.0, 75.0)
@@ -37,11 +38,11 @@ class NavigationEnv(VisualConstraintEnv):
     cannot be told from a picture.
 
     Args:
-        num_envs: number N of worlds stepped together.
+        num_envs: number N of environments stepped together.
         start: ``"fixed"`` for the paper's start, ``"random"`` for anywhere outside the wall.
         horizon: steps in an episode.
         device: CPU or CUDA device of states and images.
-        seed: seed of the worlds' random streams.
+        seed: seed of the environments' random streams.
 
     Returns:
         From ``step``: the keys of :class:`~ls3_envs.base.VisualConstraintEnv`; ``state`` is the position
@@ -78,22 +79,30 @@ class NavigationEnv(VisualConstraintEnv):
             seed=seed,
         )
         self.start = start
-        # An episode's noise is drawn at reset from the world's own stream: rows stay independent, steps stay fast.
+        # An episode's noise is sampled at reset from each environment's own stream: rows stay independent, steps fast.
         self._noise = torch.zeros(num_envs, horizon, 2, device=self.device)
         centre = (torch.arange(self.image_size, device=self.device) + 0.5) / self.image_size
         self._pixel_x, self._pixel_y = centre * WINDOW[0], centre * WINDOW[1]
-        self._background = self._draw_background()
+        self._background = self._render_background()
 
-    def plane(self, points: int = 60) -> tuple[Tensor, tuple[float, float, float, float]]:
-        """Positions ``[rows, columns, 2]`` all over the window, y downwards, and its extent."""
+    def plane(self, points: int = 60) -> Plane:
+        """The window, y downwards, with wall and goal."""
         rows = round(points * WINDOW[1] / WINDOW[0])
         x = (torch.arange(points) + 0.5) * WINDOW[0] / points
         y = (torch.arange(rows) + 0.5) * WINDOW[1] / rows
-        return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1), (0.0, WINDOW[0], WINDOW[1], 0.0)
+        return Plane(
+            states=torch.stack(torch.meshgrid(x, y, indexing="xy"), -1),
+            extent=(0.0, WINDOW[0], WINDOW[1], 0.0),
+            outlines=(Rectangle(WALL_LOW, WALL_HIGH), Circle(GOAL, GOAL_RADIUS)),
+        )
 
-    def _initial_state(self, world: int, generator: np.random.Generator) -> Tensor:
+    def advance_noiseless(self, state: Tensor, action: Tensor) -> Tensor:
+        """``s' = s + a``, stopped by the window's edges."""
+        return _inside_window(state + action)
+
+    def _initial_state(self, index: int, generator: np.random.Generator) -> Tensor:
         noise = generator.normal(scale=NOISE_STD, size=(self.horizon, 2))
-        self._noise[world] = torch.as_tensor(noise, dtype=torch.float32)
+        self._noise[index] = torch.as_tensor(noise, dtype=torch.float32)
         if self.start == "fixed":
             return torch.as_tensor(generator.normal(START, START_STD), dtype=torch.float32)
         while True:
@@ -104,7 +113,7 @@ class NavigationEnv(VisualConstraintEnv):
     def _advance(self, state: Tensor, action: Tensor) -> Tensor:
         step = self._clock.clamp(max=self.horizon - 1)
         noise = self._noise[torch.arange(self.num_envs, device=self.device), step]
-        return (state + action + noise).clamp(min=0.0).minimum(state.new_tensor(WINDOW))
+        return _inside_window(state + action + noise)
 
     def _violates(self, state: Tensor) -> Tensor:
         return in_wall(state)
@@ -112,7 +121,7 @@ class NavigationEnv(VisualConstraintEnv):
     def _succeeds(self, state: Tensor) -> Tensor:
         return (state - state.new_tensor(GOAL)).norm(dim=-1, keepdim=True) <= GOAL_RADIUS
 
-    def _draw_background(self) -> Tensor:
+    def _render_background(self) -> Tensor:
         def coverage(centre: Tensor, low: float, high: float, width: float) -> Tensor:
             covered = (centre + width / 2).clamp(max=high) - (centre - width / 2).clamp(min=low)
             return (covered / width).clamp(0.0, 1.0)
@@ -130,6 +139,10 @@ class NavigationEnv(VisualConstraintEnv):
         disc = (0.5 + (DISC_RADIUS - distance) / softness).clamp(0.0, 1.0)[:, None]
         red = torch.tensor(_RED, device=self.device).view(1, 3, 1, 1)
         return torch.lerp(self._background.expand(state.shape[0], -1, -1, -1), red, disc).round().to(torch.uint8)
+
+
+def _inside_window(position: Tensor) -> Tensor:
+    return position.clamp(min=0.0).minimum(position.new_tensor(WINDOW))
 
 
 def in_wall(position: Tensor) -> Tensor:

@@ -123,9 +123,9 @@ class SequentialPushingEnv(MujocoEnv):
         image_size: side of the image in pixels.
         physics: ``"mujoco"``, or ``"warp"`` for a GPU.
         renderer: ``"raytrace"``, or ``"egl"``.
-        threads: that share the worlds' physics; the machine's cores when ``None``.
+        threads: that share the physics; the machine's cores when ``None``.
         device: of states and pictures.
-        seed: of the worlds' random streams.
+        seed: of the environments' random streams.
 
     Returns:
         From ``step``: the keys of :class:`~ls3_envs.mujoco.MujocoEnv`; ``state`` holds the blocks' poses, the hand's
@@ -176,7 +176,7 @@ class SequentialPushingEnv(MujocoEnv):
         self._rest = torch.as_tensor(np.concatenate([self.model.qpos0, np.zeros(self.model.nv)]))
         self._ramp = (torch.arange(1, SUBSTEPS + 1, dtype=torch.float64, device=self.device) / SUBSTEPS)[:, None]
 
-    def _initial_state(self, world: int, generator: np.random.Generator) -> Tensor:
+    def _initial_state(self, index: int, generator: np.random.Generator) -> Tensor:
         state = self._rest.clone()
         place = generator.normal(HAND_START, START_STD)
         if self.start == "random":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from importlib.resources import files
 from typing import Literal
 
 import mujoco
@@ -22,39 +21,63 @@ GOAL_RADIUS = 0.015 + FINGER_RADIUS
 OBSTACLE = (0.13 * math.sin(-0.3 * math.pi), 0.13 * math.cos(-0.3 * math.pi))
 OBSTACLE_RADIUS = 0.05 + FINGER_RADIUS
 START = (0.53 * math.pi, 0.85 * math.pi)
-#: Torque of an action, as a share of the suite's.
+#: Torque of an action, as a fraction of the suite's.
 ACTION_SCALE = 0.5
 HORIZON = 100
 
 
 def reacher_model() -> mujoco.MjModel:
-    """dm_control's reacher with this task's goal and stay-out disc, in flat colours."""
-    # Read as files: importing dm_control's suite would load OpenGL.
-    suite = files("dm_control") / "suite"
-    names = ("skybox.xml", "visual.xml", "materials.xml")
-    assets = {f"./common/{name}": (suite / "common" / name).read_bytes() for name in names}
-    spec = mujoco.MjSpec.from_string((suite / "reacher.xml").read_text(), include=assets)
-    for light in list(spec.lights):
-        spec.delete(light)
-    # Shading by the headlight alone: both renderers then agree.
-    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.5] * 3, [0.5] * 3
-    spec.visual.headlight.specular = [0.0] * 3
-    colours = {"ground": (0.1, 0.15, 0.25), "root": (0.5, 0.4, 0.2), "arm": (0.85, 0.65, 0.2)}
-    colours |= {"hand": (0.85, 0.65, 0.2), "finger": (0.2, 0.7, 1.0), "target": (0.1, 0.9, 0.2)}
-    for geom in spec.geoms:
-        geom.material = ""
-        geom.rgba = [*colours.get(geom.name, (0.25, 0.3, 0.4)), 1.0]
-    target = spec.geom("target")
-    target.type, target.pos, target.size = mujoco.mjtGeom.mjGEOM_CYLINDER, [*GOAL, 0.001], [0.02, 0.001, 0.0]
-    # Flat, so that it never hides the arm.
-    spec.worldbody.add_geom(
-        name="obstacle",
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        pos=[*OBSTACLE, 0.001],
-        size=[OBSTACLE_RADIUS - FINGER_RADIUS, 0.001, 0.0],
-        rgba=[0.9, 0.1, 0.1, 1.0],
-    )
-    return spec.compile()
+    """The two-link arm with this task's goal and stay-out disc, in flat colours, as a compiled model.
+
+    Links, joints, motors, walls and cameras are those of dm_control's reacher, a test holds them equal; its lights,
+    textures and materials are left out.
+    """
+    # Sizes and constants: dm_control.suite.reacher (DeepMind, Apache-2.0).
+    blue, gold = ".25 .3 .4 1", ".85 .65 .2 1"
+    xml = f"""
+<mujoco model="two-link planar reacher">
+  <option timestep=".02">
+    <flag contact="disable"/>
+  </option>
+  <visual>
+    <headlight ambient=".5 .5 .5" diffuse=".5 .5 .5" specular="0 0 0"/>
+    <quality shadowsize="2048"/>
+  </visual>
+  <default>
+    <joint type="hinge" axis="0 0 1" damping=".01"/>
+    <motor gear=".05" ctrlrange="-1 1" ctrllimited="true"/>
+  </default>
+  <worldbody>
+    <camera name="fixed" pos="0 0 .75"/>
+    <geom name="ground" type="plane" size=".3 .3 10" rgba=".1 .15 .25 1"/>
+    <geom name="wall_x" type="plane" pos="-.3 0 .02" zaxis="1 0 0" size=".02 .3 .02" rgba="{blue}"/>
+    <geom name="wall_y" type="plane" pos="0 -.3 .02" zaxis="0 1 0" size=".3 .02 .02" rgba="{blue}"/>
+    <geom name="wall_neg_x" type="plane" pos=".3 0 .02" zaxis="-1 0 0" size=".02 .3 .02" rgba="{blue}"/>
+    <geom name="wall_neg_y" type="plane" pos="0 .3 .02" zaxis="0 -1 0" size=".3 .02 .02" rgba="{blue}"/>
+    <geom name="root" type="cylinder" fromto="0 0 0 0 0 .02" size=".011" rgba=".5 .4 .2 1"/>
+    <geom name="target" type="cylinder" pos="{GOAL[0]!r} {GOAL[1]!r} .001" size=".02 .001" rgba=".1 .9 .2 1"/>
+    <!-- Flat, so that it never hides the arm. -->
+    <geom name="obstacle" type="cylinder" pos="{OBSTACLE[0]!r} {OBSTACLE[1]!r} .001"
+          size="{OBSTACLE_RADIUS - FINGER_RADIUS!r} .001" rgba=".9 .1 .1 1"/>
+    <body name="arm" pos="0 0 .01">
+      <joint name="shoulder"/>
+      <geom name="arm" type="capsule" fromto="0 0 0 {LINK} 0 0" size=".01" rgba="{gold}"/>
+      <body name="hand" pos="{LINK} 0 0">
+        <joint name="wrist" range="-160 160" limited="true"/>
+        <geom name="hand" type="capsule" fromto="0 0 0 .1 0 0" size=".01" rgba="{gold}"/>
+        <body name="finger" pos="{LINK} 0 0">
+          <camera name="hand" pos="0 0 .2" mode="track"/>
+          <geom name="finger" type="sphere" size="{FINGER_RADIUS}" rgba=".2 .7 1 1"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="shoulder" joint="shoulder"/>
+    <motor name="wrist" joint="wrist"/>
+  </actuator>
+</mujoco>"""
+    return mujoco.MjModel.from_xml_string(xml)
 
 
 def finger_position(state: Tensor) -> Tensor:
@@ -64,7 +87,7 @@ def finger_position(state: Tensor) -> Tensor:
 
 
 class ReacherEnv(MujocoEnv):
-    """dm_control's two-link reacher with a stay-out disc between start and goal.
+    """The two-link reacher of dm_control's suite with a stay-out disc between start and goal.
 
     Actions are torques at shoulder and wrist, in ±1, halved before they are applied. The arm starts bent at
     (.53π, .85π); the goal set, top left, is where the finger touches the target; the finger may not touch the red disc,
@@ -80,9 +103,9 @@ class ReacherEnv(MujocoEnv):
         image_size: side of the image in pixels.
         physics: ``"mujoco"``, or ``"warp"`` for a GPU.
         renderer: ``"raytrace"``, or ``"egl"``.
-        threads: that share the worlds' physics; the machine's cores when ``None``.
+        threads: that share the physics; the machine's cores when ``None``.
         device: of states and pictures.
-        seed: of the worlds' random streams.
+        seed: of the environments' random streams.
 
     Returns:
         From ``step``: the keys of :class:`~ls3_envs.mujoco.MujocoEnv`; ``state`` holds two angles in radians and their
@@ -128,7 +151,7 @@ class ReacherEnv(MujocoEnv):
             seed=seed,
         )
 
-    def _initial_state(self, world: int, generator: np.random.Generator) -> Tensor:
+    def _initial_state(self, index: int, generator: np.random.Generator) -> Tensor:
         if self.start == "fixed":
             return torch.tensor([*START, 0.0, 0.0])
         while True:

@@ -2,89 +2,188 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
+import gymnasium
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import CatFrames, Compose, InitTracker, Transform, TransformedEnv, UnaryTransform
 
-from ls3_envs import demonstrators as by
 from ls3_envs.base import VisualConstraintEnv
-from ls3_envs.cable_routing import CableRoutingEnv
-from ls3_envs.navigation import NavigationEnv
-from ls3_envs.pushing import SequentialPushingEnv
-from ls3_envs.reacher import ReacherEnv
+from ls3_envs.demonstrators.scripted import Scripted, collect_episodes
+from ls3_envs.lazy import Lazy
 
 #: Episodes that are collected side by side: more would hold too many pictures at once.
 _SIDE_BY_SIDE = 100
 
+#: The paper's names of offline data: D_success, D_rand, D_constraint.
+KINDS = ("success", "rand", "constraint")
+
 
 @dataclass(frozen=True)
 class OfflineData:
-    """One kind of offline data: how many episodes (the paper's number), from which policy and start."""
+    """One kind of offline data: how many episodes, from which policy and start.
+
+    Args:
+        episodes: how many make the data set (the paper's number), at least 1.
+        policy: the scripted policy's class, or a :class:`~ls3_envs.lazy.Lazy` of it; called with ``seed``.
+        env_options: options of the environment for these episodes, e.g. another start.
+
+    Raises:
+        ValueError: for fewer than one episode.
+    """
 
     episodes: int
-    policy: Callable[..., by.Scripted]
-    env_options: dict[str, Any] = field(default_factory=dict)
+    policy: Callable[..., Scripted]
+    env_options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ValueError(f"episodes must be at least 1, got {self.episodes}.")
 
 
 @dataclass(frozen=True)
 class Domain:
-    """A row of the table.
+    """A row of the table: all that is said about a domain outside its own file.
 
     Args:
-        env: the environment's class; called with ``num_envs``, ``seed``, ``device`` and options.
+        env: the environment's class, or a :class:`~ls3_envs.lazy.Lazy` of it where its module imports packages that
+            not everybody has; called with ``num_envs``, ``seed``, ``device`` and options.
+        gym_id: its name in Gymnasium, ``"namespace/Name-v0"``.
         offline: the offline data by the paper's names ``success``, ``rand`` and ``constraint``.
         frames: pictures that are stacked into one observation, where one alone does not show velocities.
         frame_stride: steps between them; what moves less than a pixel a step is seen to move over several.
+
+    Raises:
+        ValueError: for an id that Gymnasium does not take, data of another name, fewer than one frame or a stride
+            below one step.
     """
 
     env: Callable[..., VisualConstraintEnv]
-    offline: dict[str, OfflineData]
+    gym_id: str
+    offline: Mapping[str, OfflineData] = field(default_factory=dict)
     frames: int = 1
     frame_stride: int = 1
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"([\w:-]+/)?[\w:.-]+-v\d+", self.gym_id):
+            raise ValueError(f"gym_id must read 'namespace/Name-v0', got {self.gym_id!r}.")
+        for kind in self.offline:
+            if kind not in KINDS:
+                raise ValueError(f"offline data must be called {', '.join(map(repr, KINDS))}, got {kind!r}.")
+        _check_frames(self.frames, self.frame_stride)
+
+
+def _check_frames(frames: int, stride: int) -> None:
+    for what, number in (("frames", frames), ("frame_stride", stride)):
+        if number < 1:
+            raise ValueError(f"{what} must be at least 1, got {number}.")
+
+
+_DOMAINS: dict[str, Domain] = {}
+
+#: All domains by name, to read; :func:`register` adds to them.
+DOMAINS: Mapping[str, Domain] = MappingProxyType(_DOMAINS)
+
+
+def register(name: str, row: Domain) -> None:
+    """Add a domain: ``make``, ``collect_offline``, Gymnasium and every list of domains know it from then on.
+
+    Args:
+        name: of the domain, as in ``make(name)``.
+        row: what there is to say about it.
+
+    Raises:
+        ValueError: for a name or a Gymnasium id that is taken.
+
+    Example:
+        >>> from ls3_envs.navigation import NavigationEnv
+        >>> register("my_navigation", Domain(NavigationEnv, "me/Navigation-v0"))
+        >>> make("my_navigation", 2, horizon=7).base_env.horizon
+        7
+        >>> unregister("my_navigation")
+    """
+    if name in _DOMAINS:
+        raise ValueError(f"Domain {name!r} is registered already. Choose another name, or unregister({name!r}) first.")
+    if row.gym_id in gymnasium.registry:
+        raise ValueError(f"Gymnasium has an environment {row.gym_id!r} already. Choose another gym_id for {name!r}.")
+    gymnasium.register(
+        row.gym_id,
+        entry_point="ls3_envs.gym:GymEnv",
+        vector_entry_point="ls3_envs.gym:GymVectorEnv",
+        kwargs={"domain": name},
+    )
+    _DOMAINS[name] = row
+
+
+def unregister(name: str) -> None:
+    """Take a domain out again, its Gymnasium id included: for tests, and to define one anew in a notebook.
+
+    Raises:
+        ValueError: for an unknown domain.
+    """
+    del gymnasium.registry[domain(name).gym_id]
+    del _DOMAINS[name]
 
 
 _ANYWHERE: dict[str, Any] = {"start": "random"}
 
-DOMAINS: dict[str, Domain] = {
-    "navigation": Domain(
-        env=NavigationEnv,
+register(
+    "navigation",
+    Domain(
+        env=Lazy("ls3_envs.navigation:NavigationEnv"),
+        gym_id="ls3/Navigation-v0",
         offline={
-            "success": OfflineData(50, by.NavigationDemonstrator),
-            "constraint": OfflineData(50, by.NavigationViolator, _ANYWHERE),
+            "success": OfflineData(50, Lazy("ls3_envs.demonstrators.navigation:NavigationDemonstrator")),
+            "constraint": OfflineData(50, Lazy("ls3_envs.demonstrators.navigation:NavigationViolator"), _ANYWHERE),
         },
     ),
-    "reacher": Domain(
-        env=ReacherEnv,
+)
+register(
+    "reacher",
+    Domain(
+        env=Lazy("ls3_envs.reacher:ReacherEnv"),
+        gym_id="ls3/Reacher-v0",
         offline={
-            "success": OfflineData(50, by.ReacherDemonstrator),
-            "constraint": OfflineData(50, by.ReacherViolator, _ANYWHERE),
-            "rand": OfflineData(100, by.ReacherWanderer, {"start": "random", "horizon": 20}),
+            "success": OfflineData(50, Lazy("ls3_envs.demonstrators.reacher:ReacherDemonstrator")),
+            "constraint": OfflineData(50, Lazy("ls3_envs.demonstrators.reacher:ReacherViolator"), _ANYWHERE),
+            "rand": OfflineData(
+                100, Lazy("ls3_envs.demonstrators.reacher:ReacherWanderer"), {"start": "random", "horizon": 20}
+            ),
         },
         frames=3,
         frame_stride=4,
     ),
-    "pushing": Domain(
-        env=SequentialPushingEnv,
+)
+register(
+    "pushing",
+    Domain(
+        env=Lazy("ls3_envs.pushing:SequentialPushingEnv"),
+        gym_id="ls3/SequentialPushing-v0",
         offline={
-            "success": OfflineData(500, by.PushingDemonstrator),
-            "constraint": OfflineData(300, by.PushingViolator, _ANYWHERE),
+            "success": OfflineData(500, Lazy("ls3_envs.demonstrators.pushing:PushingDemonstrator")),
+            "constraint": OfflineData(300, Lazy("ls3_envs.demonstrators.pushing:PushingViolator"), _ANYWHERE),
         },
     ),
-    "cable_routing": Domain(
-        env=CableRoutingEnv,
+)
+register(
+    "cable_routing",
+    Domain(
+        env=Lazy("ls3_envs.cable_routing:CableRoutingEnv"),
+        gym_id="ls3/CableRouting-v0",
         offline={
-            "success": OfflineData(420, by.CableDemonstrator),
-            "rand": OfflineData(150, by.CableWanderer),
-            "constraint": OfflineData(50, by.CableViolator),
+            "success": OfflineData(420, Lazy("ls3_envs.demonstrators.cable_routing:CableDemonstrator")),
+            "rand": OfflineData(150, Lazy("ls3_envs.demonstrators.cable_routing:CableWanderer")),
+            "constraint": OfflineData(50, Lazy("ls3_envs.demonstrators.cable_routing:CableViolator")),
         },
     ),
-}
+)
 
 
 def domain(name: str) -> Domain:
@@ -96,6 +195,12 @@ def domain(name: str) -> Domain:
     if name not in DOMAINS:
         raise ValueError(f"Unknown domain {name!r}. Known domains: {', '.join(sorted(DOMAINS))}.")
     return DOMAINS[name]
+
+
+def lazy_classes() -> dict[str, Lazy]:
+    """This package's own environments and demonstrators, as far as rows name them by address, by class name."""
+    parts = [part for row in DOMAINS.values() for part in (row.env, *(data.policy for data in row.offline.values()))]
+    return {part.name: part for part in parts if isinstance(part, Lazy) and part.module.startswith("ls3_envs.")}
 
 
 def _every(pixels: Tensor, stride: int) -> Tensor:
@@ -115,7 +220,7 @@ def _stack(frames: int, stride: int) -> list[Transform]:
 def make(
     name: str, num_envs: int = 1, *, frames: int | None = None, frame_stride: int | None = None, **options: Any
 ) -> TransformedEnv:
-    """The domain ``name`` with ``num_envs`` worlds, marks at the starts of episodes, and frames stacked.
+    """The domain ``name`` with ``num_envs`` environments, marks at the starts of episodes, and frames stacked.
 
     Args:
         name: of the domain.
@@ -126,6 +231,7 @@ def make(
 
     Raises:
         ValueError: for an unknown domain, fewer than one frame or a stride below one step.
+        ModuleNotFoundError: when the domain needs a package that is not installed.
 
     Example:
         >>> make("navigation", num_envs=3, seed=0).batch_size
@@ -134,9 +240,7 @@ def make(
     row = domain(name)
     frames = row.frames if frames is None else frames
     stride = row.frame_stride if frame_stride is None else frame_stride
-    for what, number in (("frames", frames), ("frame_stride", stride)):
-        if number < 1:
-            raise ValueError(f"{what} must be at least 1, got {number}.")
+    _check_frames(frames, stride)
     return TransformedEnv(row.env(num_envs=num_envs, **options), Compose(*_stack(frames, stride), InitTracker()))
 
 
@@ -149,7 +253,7 @@ def collect_offline(
         name: the domain.
         kind: ``"success"``, ``"rand"`` or ``"constraint"``, as far as the domain has it.
         episodes: how many; the paper's number when ``None``.
-        seed: seed of worlds and demonstrator.
+        seed: seed of environments and demonstrator.
         device: where to simulate.
 
     Returns:
@@ -175,5 +279,5 @@ def collect_offline(
         # Streams of their own; those of the first part do not depend on how many parts there are.
         own = seed + 7_919 * first
         env = make(name, num_envs=part, seed=own, device=device, **recipe.env_options)
-        parts.append(by.collect_episodes(env, recipe.policy(seed=own)))
+        parts.append(collect_episodes(env, recipe.policy(seed=own)))
     return torch.cat(parts) if len(parts) > 1 else parts[0]

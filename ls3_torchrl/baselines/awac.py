@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
+from torchrl.data import Bounded
 from torchrl.objectives import SACLoss
 
 from ls3_torchrl.baselines.networks import action_bounds
@@ -14,15 +15,15 @@ from ls3_torchrl.baselines.networks import action_bounds
 class AWACLoss(SACLoss):
     """SAC's critics without entropy, and an actor that imitates the data's actions, each by its advantage.
 
-    The actor descends −E[w(s, a) log π(a | s)] with w ∝ exp(A(s, a) / λ), A(s, a) = min_i Q_i(s, a) − V(s) and V(s) =
+    The actor minimises −E[w(s, a) log π(a | s)] with w ∝ exp(A(s, a) / λ), A(s, a) = min_i Q_i(s, a) − V(s) and V(s) =
     min_i Q_i(s, a'), a' ~ π. The weights are normalised over the batch to mean 1, which keeps them finite whatever
     the scale of the rewards (equation (8) of Nair et al. leaves the normaliser out).
 
     Args:
-        actor_network: π, with a ``spec``.
+        actor_network: π, with a ``spec`` that bounds its action, whatever the action's key.
         qvalue_network: Q.
         temperature: λ > 0: small ones imitate the best actions alone, large ones all.
-        margin: share of the actions' box at its edges in which an action counts as one just inside. A squashed
+        margin: fraction of the actions' box at its edges in which an action counts as one just inside. A squashed
             Gaussian has no density on the edge, where clipped demonstrations lie.
         num_qvalue_nets: how many Q.
         loss_function: of the critics.
@@ -32,7 +33,8 @@ class AWACLoss(SACLoss):
         ``entropy``.
 
     Raises:
-        ValueError: for a temperature that is not positive, or a margin outside (0, 0.5).
+        ValueError: for a temperature that is not positive, a margin outside (0, 0.5), or an actor whose action has no
+            bounds.
 
     Source: Nair et al., "AWAC: Accelerating Online Reinforcement Learning with Offline Datasets", section 4.
 
@@ -76,7 +78,13 @@ class AWACLoss(SACLoss):
             fixed_alpha=True,
         )
         self.temperature, self.margin = temperature, margin
-        low, high = action_bounds(actor_network.spec["action"])
+        boxes = [spec for spec in actor_network.spec.values(True, True) if isinstance(spec, Bounded)]
+        if len(boxes) != 1:
+            raise ValueError(
+                f"AWACLoss needs an actor whose spec bounds one output, the action; {len(boxes)} of "
+                f"{actor_network.out_keys} are bounded. Build the actor with the action's Bounded spec."
+            )
+        low, high = action_bounds(boxes[0])
         self.register_buffer("lowest", low + margin * (high - low))
         self.register_buffer("highest", high - margin * (high - low))
 
@@ -86,13 +94,13 @@ class AWACLoss(SACLoss):
             with self.actor_network_params.to_module(self.actor_network):
                 own = self.actor_network.get_dist(tensordict).rsample()
             seen = tensordict.select(*self.qvalue_network.in_keys)
-            drawn = seen.copy().set(self.tensor_keys.action, own)
-            best = [self._least_value(rows) for rows in (seen, drawn)]
+            sampled = seen.copy().set(self.tensor_keys.action, own)
+            best = [self._least_value(rows) for rows in (seen, sampled)]
         return best[0] - best[1]
 
     def _least_value(self, rows: TensorDictBase) -> Tensor:
-        found = self._vmap_qnetworkN0(rows, self.qvalue_network_params)
-        return found.get(self.tensor_keys.state_action_value).min(0).values.squeeze(-1)
+        values = self._vmap_qnetworkN0(rows, self.qvalue_network_params)
+        return values.get(self.tensor_keys.state_action_value).min(0).values.squeeze(-1)
 
     def weights(self, advantage: Tensor) -> Tensor:
         """W ∝ exp(A / λ) with mean 1 over all rows."""

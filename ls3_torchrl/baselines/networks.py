@@ -49,7 +49,7 @@ class PixelFeatures(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         """Features ``[*B, 1024]`` of uint8 images ``[*B, C, 64, 64]``."""
-        return self.convolutions(pixels.float() / 255.0)
+        return self.convolutions(pixels.to(self.convolutions[0].weight.dtype) / 255.0)
 
 
 class ObservedAction(nn.Module):
@@ -77,7 +77,8 @@ class ObservedAction(nn.Module):
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         """``[*B, F + A]`` of observations ``[*B, …]`` and actions ``[*B, A]``."""
-        return torch.cat([self.features(observation), (action - self.middle) / self.reach], -1)
+        features = self.features(observation)
+        return torch.cat([features, ((action - self.middle) / self.reach).to(features.dtype)], -1)
 
 
 class _TwoInputs(nn.Sequential):
@@ -100,6 +101,7 @@ def gaussian_actor(
     in_features: int,
     *,
     observation_key: NestedKey = "loc",
+    action_key: NestedKey = "action",
     features: nn.Module | None = None,
     hidden: Sequence[int] = (256, 256),
     initial_std: float = 1.0,
@@ -108,9 +110,11 @@ def gaussian_actor(
 
     Args:
         action_spec: of one action ``[A]``, or batched.
-        in_features: size of what is observed, or of ``features``.
+        in_features: size of the observation, or of ``features``.
         observation_key: what is read: latents, or images with ``features``.
-        features: reads what is observed first, such as :class:`PixelFeatures`.
+        action_key: action ``[*B, A]``. Beside it the actor writes ``…_loc`` and ``…_scale``, and ``…_log_prob``
+            ``[*B]``.
+        features: reads the observation first, such as :class:`PixelFeatures`.
         hidden: sizes of the hidden layers.
         initial_std: standard deviation before squashing of an untrained actor, about.
 
@@ -126,14 +130,22 @@ def gaussian_actor(
         _actor_network(in_features, 2 * len(low), features, hidden),
         NormalParamExtractor(scale_mapping=f"biased_softplus_{initial_std}"),
     )
+    loc_key, scale_key, log_prob_key = (_beside(action_key, name) for name in ("loc", "scale", "log_prob"))
     return ProbabilisticActor(
-        TensorDictModule(network, [observation_key], ["action_loc", "action_scale"]),
-        in_keys={"loc": "action_loc", "scale": "action_scale"},
+        TensorDictModule(network, [observation_key], [loc_key, scale_key]),
+        in_keys={"loc": loc_key, "scale": scale_key},
+        out_keys=[action_key],
         spec=Bounded(low=low, high=high, shape=low.shape),
         distribution_class=TanhNormal,
         distribution_kwargs={"low": low, "high": high},
         return_log_prob=True,
+        log_prob_key=log_prob_key,
     )
+
+
+def _beside(key: NestedKey, name: str) -> NestedKey:
+    """The key of something that belongs to what is under ``key``."""
+    return f"{key}_{name}" if isinstance(key, str) else (*key[:-1], f"{key[-1]}_{name}")
 
 
 def deterministic_actor(
@@ -141,6 +153,7 @@ def deterministic_actor(
     in_features: int,
     *,
     observation_key: NestedKey = "loc",
+    action_key: NestedKey = "action",
     features: nn.Module | None = None,
     hidden: Sequence[int] = (256, 256),
 ) -> TensorDictSequential:
@@ -155,8 +168,8 @@ def deterministic_actor(
     low, high = action_bounds(action_spec)
     network = _actor_network(in_features, len(low), features, hidden)
     return TensorDictSequential(
-        TensorDictModule(network, [observation_key], ["action"]),
-        TanhModule(in_keys=["action"], spec=Bounded(low=low, high=high, shape=low.shape)),
+        TensorDictModule(network, [observation_key], [action_key]),
+        TanhModule(in_keys=[action_key], spec=Bounded(low=low, high=high, shape=low.shape)),
     )
 
 
@@ -165,10 +178,21 @@ def action_value(
     in_features: int,
     *,
     observation_key: NestedKey = "loc",
+    action_key: NestedKey = "action",
+    value_key: NestedKey = "state_action_value",
     features: nn.Module | None = None,
     hidden: Sequence[int] = (256, 256),
 ) -> ValueOperator:
-    """Q(s, a), written as ``state_action_value``. Arguments as for :func:`gaussian_actor`.
+    """Q(s, a), the value of an action in a state.
+
+    Args:
+        action_spec: of one action ``[A]``, or batched.
+        in_features: size of the observation, or of ``features``.
+        observation_key: what is read: latents, or images with ``features``.
+        action_key: action ``[*B, A]``.
+        value_key: where the value ``[*B, 1]`` is written.
+        features: reads the observation first.
+        hidden: sizes of the hidden layers.
 
     Example:
         >>> from tensordict import TensorDict
@@ -180,4 +204,4 @@ def action_value(
     width = in_features + action_spec.shape[-1]
     mlp = MLP(width, 1, num_cells=list(hidden), activation_class=nn.ReLU)
     network = _TwoInputs(ObservedAction(action_spec, features), mlp)
-    return ValueOperator(network, in_keys=[observation_key, "action"])
+    return ValueOperator(network, in_keys=[observation_key, action_key], out_keys=[value_key])

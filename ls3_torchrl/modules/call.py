@@ -9,6 +9,22 @@ from torch import Tensor
 from torch.func import functional_call
 
 
+def call_with_params(
+    network: TensorDictModuleBase, params: TensorDictParams, tensordict: TensorDictBase, **options: bool
+) -> TensorDictBase:
+    """What a module writes with other weights than its own, such as the lagged ones of a target network.
+
+    Args:
+        network: the module.
+        params: weights and buffers under the names that the module has for them.
+        tensordict: what the module reads.
+        options: passed on to the module.
+    """
+    # Not params.to_module(): it leaves the lagged copies behind as parameters that ask for gradients.
+    weights = {key if isinstance(key, str) else ".".join(key): value for key, value in params.items(True, True)}
+    return functional_call(network, weights, (tensordict,), options)
+
+
 def call_on_latent(
     network: TensorDictModuleBase, latent: Tensor, *, params: TensorDictParams | None = None, **options: bool
 ) -> Tensor:
@@ -20,12 +36,10 @@ def call_on_latent(
         params: weights to use instead of the module's own.
         options: passed on to the module.
     """
-    entry = TensorDict({network.in_keys[0]: latent}, batch_size=latent.shape[:1])
+    entry = TensorDict({network.in_keys[0]: latent}, batch_size=latent.shape[:-1])
     if params is None:
         return network(entry, **options).get(network.out_keys[0])
-    # Not params.to_module(): it leaves the lagged copies behind as parameters that ask for gradients.
-    weights = {key if isinstance(key, str) else ".".join(key): value for key, value in params.items(True, True)}
-    return functional_call(network, weights, (entry,), options).get(network.out_keys[0])
+    return call_with_params(network, params, entry, **options).get(network.out_keys[0])
 
 
 def probability(classifier: TensorDictModuleBase, latent: Tensor) -> Tensor:

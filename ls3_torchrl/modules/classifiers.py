@@ -1,8 +1,9 @@
-"""Safe set f_S, constraint estimator f_C and goal estimator f_G: three binary judgements of a latent."""
+"""Safe set f_S, constraint estimator f_C and goal estimator f_G: three binary classifiers of a latent."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -10,21 +11,42 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from ls3_torchrl._checks import require_keys
+from ls3_torchrl.modules.call import probability
 
 
 class LatentClassifier(TensorDictModuleBase):
     """Probability that a latent has a property: 3 hidden layers of 256, a logit out (section 1.1.1).
 
+    A subclass names the property, and where batches hold its label:
+
+    Attributes:
+        name: the property; the logit is written under ``"{name}_logit"``, under ``"logit"`` without a name.
+        label_key: what :class:`~ls3_torchrl.objectives.ClassifierLoss` learns from, bool ``[*B, 1]``; ``None`` where
+            there is no such label.
+
     Args:
         latent_dim: D.
         hidden: sizes of the hidden layers.
         latent_key: latent ``[*B, D]``.
-        logit_key: where the logit ``[*B, 1]`` is written.
+        logit_key: where the logit ``[*B, 1]`` is written; ``None`` is the key by name.
         prob_key: where the probability ``[*B, 1]`` is written as well; nowhere when ``None``.
 
     Raises:
         KeyError: when the latent is missing.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> class Slippery(LatentClassifier):
+        ...     name = "slippery"
+        ...     label_key = ("next", "slippery")
+        >>> td = Slippery(latent_dim=8)(TensorDict({"latent": torch.zeros(4, 8)}, [4]))
+        >>> td["slippery_logit"].shape
+        torch.Size([4, 1])
     """
+
+    name: ClassVar[str | None] = None
+    label_key: ClassVar[NestedKey | None] = None
 
     def __init__(
         self,
@@ -32,10 +54,12 @@ class LatentClassifier(TensorDictModuleBase):
         *,
         hidden: Sequence[int] = (256, 256, 256),
         latent_key: NestedKey = "latent",
-        logit_key: NestedKey = "logit",
+        logit_key: NestedKey | None = None,
         prob_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
+        if logit_key is None:
+            logit_key = "logit" if self.name is None else f"{self.name}_logit"
         self.in_keys = [latent_key]
         self.out_keys = [logit_key] if prob_key is None else [logit_key, prob_key]
         self.network: nn.Module = MLP(
@@ -53,11 +77,14 @@ class LatentClassifier(TensorDictModuleBase):
 
     def probability(self, latent: Tensor) -> Tensor:
         """Probabilities ``[*B, 1]`` in [0, 1] of latents ``[*B, D]``."""
-        return self.network(latent).sigmoid()
+        return probability(self, latent)
 
 
 class SafeSet(LatentClassifier):
     """f_S(z): can a state be brought back into a trajectory that succeeded? (equation (5)).
+
+    Arguments as for :class:`LatentClassifier`. It has no label: :class:`~ls3_torchrl.objectives.SafeSetLoss` makes its
+    targets.
 
     Example:
         >>> import torch
@@ -68,16 +95,7 @@ class SafeSet(LatentClassifier):
         (torch.Size([4, 1]), torch.Size([4, 1]))
     """
 
-    def __init__(
-        self,
-        latent_dim: int,
-        *,
-        hidden: Sequence[int] = (256, 256, 256),
-        latent_key: NestedKey = "latent",
-        logit_key: NestedKey = "safe_set_logit",
-        prob_key: NestedKey | None = None,
-    ) -> None:
-        super().__init__(latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key)
+    name = "safe_set"
 
 
 class ConstraintEstimator(LatentClassifier):
@@ -91,16 +109,8 @@ class ConstraintEstimator(LatentClassifier):
         torch.Size([4, 1])
     """
 
-    def __init__(
-        self,
-        latent_dim: int,
-        *,
-        hidden: Sequence[int] = (256, 256, 256),
-        latent_key: NestedKey = "latent",
-        logit_key: NestedKey = "constraint_logit",
-        prob_key: NestedKey | None = None,
-    ) -> None:
-        super().__init__(latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key)
+    name = "constraint"
+    label_key = ("next", "constraint")
 
 
 class GoalEstimator(LatentClassifier):
@@ -114,13 +124,5 @@ class GoalEstimator(LatentClassifier):
         torch.Size([4, 1])
     """
 
-    def __init__(
-        self,
-        latent_dim: int,
-        *,
-        hidden: Sequence[int] = (256, 256, 256),
-        latent_key: NestedKey = "latent",
-        logit_key: NestedKey = "goal_logit",
-        prob_key: NestedKey | None = None,
-    ) -> None:
-        super().__init__(latent_dim, hidden=hidden, latent_key=latent_key, logit_key=logit_key, prob_key=prob_key)
+    name = "goal"
+    label_key = ("next", "success")

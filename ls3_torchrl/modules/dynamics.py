@@ -19,17 +19,17 @@ Propagation = Literal["ts1", "tsinf"]
 class EnsembleDynamics(TensorDictModuleBase):
     """M networks, each a Gaussian over the next latent: N(z + Δ_m(z, a), σ_m(z, a)²).
 
-    Two hidden layers of 128 (section 1.1.1). ``forward`` imagines one step: every row, a particle, is moved by
-    one member and its noise. The change Δ_m(z, a) and σ_m are
+    Two hidden layers of 128 (section 1.1.1). ``forward`` imagines one step: every row, a particle, is moved by one
+    member and its noise. Members and noise that are already in the tensordict are used as they are, which makes
+    rollouts repeatable.
 
-    * a network of latent and action together, the paper's choice; or
-    * with ``control_affine``, Δ_m = b_m(z) + A_m(z) a and σ_m(z), networks of the latent alone. Most mechanics have
-      this form, and few demonstrations then tell what actions do that they hardly contain.
+    The mean change Δ_m and the standard deviation σ_m come from one network of latent and action together, which is the
+    paper's choice. With ``control_affine`` the network sees the latent alone, and Δ_m(z, a) = b_m(z) + A_m(z) a with
+    σ_m(z). Most mechanics have this form, and few demonstrations then tell what actions do that they hardly contain.
 
-    * ``"ts1"``: each row draws a member anew at every step (TS-1, the paper's choice).
-    * ``"tsinf"``: a row keeps the member that it drew first; it travels under ``member_key`` (TS-∞).
-
-    Members and noise that are already in the tensordict are used as they are, which makes rollouts repeatable.
+    ``propagation`` says which member moves a particle from step to step: with ``"ts1"`` (TS-1, the paper's choice) one
+    that is sampled at every step, with ``"tsinf"`` (TS-∞) the one that was sampled first, which travels under
+    ``member_key``.
 
     Args:
         latent_dim: D.
@@ -44,8 +44,8 @@ class EnsembleDynamics(TensorDictModuleBase):
         latent_key: latent ``[*B, D]``.
         action_key: action ``[*B, A]``, in the environment's units.
         next_latent_key: where the imagined next latent ``[*B, D]`` is written.
-        member_key: member of each row, int64 ``[*B, 1]`` in 0…M−1; drawn when absent, written for ``"tsinf"``.
-        noise_key: standard normal noise ``[*B, D]``; drawn when absent.
+        member_key: member of each row, int64 ``[*B, 1]`` in 0…M−1; sampled when absent, written for ``"tsinf"``.
+        noise_key: standard normal noise ``[*B, D]``; sampled when absent.
 
     Raises:
         ValueError: for an unknown propagation, or an ``action_scale`` that is not positive or not of size A.
@@ -142,7 +142,7 @@ class EnsembleDynamics(TensorDictModuleBase):
         return latent + delta, log_scale.exp()
 
     def unroll(self, latent: Tensor, actions: Tensor, *, per_member: bool = False) -> tuple[Tensor, Tensor]:
-        """Every member's mean and standard deviation over K steps, each member carrying its own mean on.
+        """Every member's means and standard deviations over K steps, starting each step from its own last mean.
 
         Args:
             latent: ``[*B, D]``, or ``[*B, M, D]`` with ``per_member``.
@@ -150,7 +150,7 @@ class EnsembleDynamics(TensorDictModuleBase):
             per_member: member m sees column m of the last batch dimension.
 
         Returns:
-            Mean and standard deviation, each ``[*B, M, K, D]``.
+            Means and standard deviations, each ``[*B, M, K, D]``.
         """
         if not per_member:
             latent = latent.unsqueeze(-2).expand(*latent.shape[:-1], self.num_members, -1)
@@ -162,7 +162,7 @@ class EnsembleDynamics(TensorDictModuleBase):
             scales.append(scale)
         return torch.stack(means, -2), torch.stack(scales, -2)
 
-    def draw_members(self, num_rows: int, *, device: torch.device | None = None) -> Tensor:
+    def sample_members(self, num_rows: int, *, device: torch.device | None = None) -> Tensor:
         """Members for ``num_rows`` particles, int64 ``[num_rows]``: as even a split as can be, in random order."""
         order = torch.randperm(num_rows, device=device) % self.num_members
         return torch.randperm(self.num_members, device=device)[order]
@@ -173,7 +173,7 @@ class EnsembleDynamics(TensorDictModuleBase):
         latent, action = (tensordict.get(key) for key in self.in_keys)
         members = tensordict.get(self.member_key, None)
         if members is None:
-            members = self.draw_members(latent[..., 0].numel(), device=latent.device)
+            members = self.sample_members(latent[..., 0].numel(), device=latent.device)
             members = members.reshape(*latent.shape[:-1], 1)
             if self.propagation == "tsinf":
                 tensordict.set(self.member_key, members)

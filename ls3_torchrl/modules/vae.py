@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -15,115 +14,36 @@ from tensordict.nn import (
     TensorDictModuleBase,
 )
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 from torch.distributions import Normal
 from torchrl.modules import NormalParamExtractor
 
 from ls3_torchrl._checks import require_at_least, require_finite, require_keys, require_positive
+from ls3_torchrl.modules.convolutions import FastConv2d, FastConvTranspose2d
 
 IMAGE_SIZE = 64
 _FEATURES = 256
 _INITIAL_LOG_SCALE = -3.0
-#: Output channels that fill too little of a vector for a transposed convolution to be fast.
-_FEW_CHANNELS = 16
 
 
-def as_unit_pixels(pixels: Tensor, channels: int) -> Tensor:
-    """Images as float32 in [0, 1].
+def as_unit_pixels(pixels: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Images of any size as floats in [0, 1].
 
     Args:
-        pixels: ``[*B, C, 64, 64]``, uint8 in 0…255, or floating point already in [0, 1].
-        channels: the C that is expected.
+        pixels: ``[*B, C, H, W]``, uint8 in 0…255, or floating point already in [0, 1].
+        dtype: of the floats.
 
     Raises:
-        ValueError: for another shape, or floats that are not finite.
+        ValueError: for floats that are not finite.
         TypeError: for another dtype.
     """
-    if pixels.ndim < 3 or tuple(pixels.shape[-3:]) != (channels, IMAGE_SIZE, IMAGE_SIZE):
-        raise ValueError(
-            f"Pixels must have shape [*B, {channels}, {IMAGE_SIZE}, {IMAGE_SIZE}] (channels first), "
-            f"got {list(pixels.shape)}. Resize or permute the images, or build the encoder with in_channels "
-            "= 3 x stacked frames."
-        )
     if pixels.ndim == 4:  # the convolutions' own order of memory, taken on while the images are small
         pixels = pixels.contiguous(memory_format=torch.channels_last)
     if pixels.dtype == torch.uint8:
-        return pixels.float().div_(255.0)
+        return pixels.to(dtype).div_(255.0)
     if pixels.is_floating_point():
         require_finite(pixels, "The image batch")
-        return pixels.float()
+        return pixels.to(dtype)
     raise TypeError(f"Pixels must be uint8 in 0..255 or floating point in [0, 1], got {pixels.dtype}.")
-
-
-def _in_memory_order(images: Tensor) -> Tensor:
-    """Images ``[B, C, H, W]`` as rows, pixel by pixel: no copy where they are kept channels last."""
-    return images.permute(0, 2, 3, 1).flatten(1)
-
-
-class _Conv2d(nn.Conv2d):
-    """A convolution that is one matrix product where the kernel covers the whole input: same result, less time."""
-
-    def forward(self, input: Tensor) -> Tensor:
-        if tuple(input.shape[-2:]) != self.kernel_size:
-            return super().forward(input)
-        return nn.functional.linear(_in_memory_order(input), _in_memory_order(self.weight), self.bias)[..., None, None]
-
-
-class _TransposedConvolution(torch.autograd.Function):
-    """``conv_transpose2d`` for CPUs: the same result, forwards and backwards each the way that is faster there.
-
-    The bias's gradient is a plain sum: the library's own can take longer than those of input and weights together. With
-    few output channels the way forwards is an ordinary convolution that writes the stride² pixels under each input
-    pixel as channels (Shi et al. 2016, arXiv 1609.07009).
-    """
-
-    @staticmethod
-    def forward(input: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
-        channels, kernel = weight.shape[1], weight.shape[-1]
-        if channels >= _FEW_CHANNELS or kernel % stride:
-            return nn.functional.conv_transpose2d(input, weight, bias, stride)
-        # out[s q + r] = Σ_j in[q - j] w[s j + r]: for each r a convolution with every s-th tap, last to first.
-        taps = kernel // stride
-        phases = weight.unflatten(-1, (taps, stride)).unflatten(-3, (taps, stride)).flip(2, 4)
-        phases = phases.permute(3, 5, 1, 0, 2, 4).flatten(0, 2).contiguous(memory_format=torch.channels_last)
-        made = nn.functional.conv2d(input, phases, bias.repeat(stride**2), padding=taps - 1).permute(0, 2, 3, 1)
-        size = [len(input), channels, *(stride * side for side in made.shape[1:3])]
-        out = torch.empty(size, dtype=made.dtype, device=made.device, memory_format=torch.channels_last)
-        shuffled = out.permute(0, 2, 3, 1).unflatten(2, (-1, stride)).unflatten(1, (-1, stride))
-        shuffled.copy_(made.unflatten(-1, (stride, stride, channels)).transpose(2, 3))
-        return out
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor, int], output: Tensor) -> None:
-        input, weight, _, ctx.stride = inputs
-        ctx.save_for_backward(input, weight)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None, None]:
-        input, weight = ctx.saved_tensors
-        wanted = [ctx.needs_input_grad[0], ctx.needs_input_grad[1], False]
-        stride = [ctx.stride] * 2
-        of_input, of_weight, _ = torch.ops.aten.convolution_backward(
-            gradient, input, weight, None, stride, [0, 0], [1, 1], True, [0, 0], 1, wanted
-        )
-        return of_input, of_weight, gradient.sum((0, 2, 3)) if ctx.needs_input_grad[2] else None, None
-
-
-class _ConvTranspose2d(nn.ConvTranspose2d):
-    """A transposed convolution, the same result in less time; one matrix product where the input is a single pixel."""
-
-    def forward(self, input: Tensor, output_size: list[int] | None = None) -> Tensor:
-        if output_size is not None or input.device.type != "cpu":
-            return super().forward(input, output_size)
-        assert self.bias is not None
-        if tuple(input.shape[-2:]) == (1, 1):
-            channels, *kernel = self.weight.shape[1:]
-            image = (input.flatten(1) @ _in_memory_order(self.weight)).unflatten(-1, (*kernel, channels))
-            return image.add_(self.bias.to(image.dtype)).permute(0, 3, 1, 2)
-        dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else input.dtype
-        operands = (x.to(dtype) for x in (input, self.weight, self.bias))
-        return _TransposedConvolution.apply(*operands, self.stride[0])
 
 
 class _ConvolutionalPosterior(nn.Module):
@@ -140,7 +60,7 @@ class _ConvolutionalPosterior(nn.Module):
             nn.ReLU(inplace=True),
             nn.Conv2d(64, 128, 4, stride=2),
             nn.ReLU(inplace=True),
-            _Conv2d(128, _FEATURES, 4, stride=2),
+            FastConv2d(128, _FEATURES, 4, stride=2),
             nn.ReLU(inplace=True),
             nn.Flatten(),
         )
@@ -151,10 +71,18 @@ class _ConvolutionalPosterior(nn.Module):
         self.to_params = NormalParamExtractor(scale_mapping="exp", scale_lb=min_scale)
 
     def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        images = as_unit_pixels(pixels, self.in_channels)
+        if pixels.ndim < 3 or tuple(pixels.shape[-3:]) != (self.in_channels, IMAGE_SIZE, IMAGE_SIZE):
+            raise ValueError(
+                f"Pixels must have shape [*B, {self.in_channels}, {IMAGE_SIZE}, {IMAGE_SIZE}] (channels first), "
+                f"got {list(pixels.shape)}. Resize or permute the images, or build the encoder with in_channels "
+                "= 3 x stacked frames."
+            )
+        dtype = self.head.weight.dtype
+        images = as_unit_pixels(pixels, dtype)
         batch = images.shape[:-3]
         images = images.reshape(-1, *images.shape[-3:]).contiguous(memory_format=torch.channels_last)
-        loc, scale = self.to_params(self.head(self.convolutions(images)).float())
+        # Not in the lower precision of autocast: it cannot tell means that are close together.
+        loc, scale = self.to_params(self.head(self.convolutions(images)).to(dtype))
         return loc.reshape(*batch, -1), scale.reshape(*batch, -1)
 
 
@@ -243,11 +171,11 @@ class PixelDecoder(TensorDictModuleBase):
     Args:
         out_channels: C, 3 × stacked frames.
         latent_dim: D.
-        background: add what the network draws to a fixed image, :attr:`background` ``[C, 64, 64]``, black until
+        background: add the network's output to a fixed image, :attr:`background` ``[C, 64, 64]``, black until
             :meth:`set_background` is called. With the mean image, the network need not learn it before it sees what
             moves. The paper has none.
         latent_key: where latents ``[*B, D]`` are read.
-        reco_key: where images ``[*B, C, 64, 64]`` in about [0, 1] are written, float32.
+        reco_key: where images ``[*B, C, 64, 64]`` in about [0, 1] are written, in the latents' dtype.
 
     Raises:
         KeyError: when the latent is missing.
@@ -275,20 +203,20 @@ class PixelDecoder(TensorDictModuleBase):
         self.network = nn.Sequential(
             nn.Linear(latent_dim, _FEATURES),
             nn.Unflatten(-1, (_FEATURES, 1, 1)),
-            _ConvTranspose2d(_FEATURES, 128, 5, stride=2),
+            FastConvTranspose2d(_FEATURES, 128, 5, stride=2),
             nn.ReLU(inplace=True),
-            _ConvTranspose2d(128, 64, 5, stride=2),
+            FastConvTranspose2d(128, 64, 5, stride=2),
             nn.ReLU(inplace=True),
-            _ConvTranspose2d(64, 32, 6, stride=2),
+            FastConvTranspose2d(64, 32, 6, stride=2),
             nn.ReLU(inplace=True),
-            _ConvTranspose2d(32, out_channels, 6, stride=2),
+            FastConvTranspose2d(32, out_channels, 6, stride=2),
         )
         self.background: Tensor | None
         self.register_buffer("background", torch.zeros(out_channels, IMAGE_SIZE, IMAGE_SIZE) if background else None)
 
     @torch.no_grad()
     def set_background(self, image: Tensor) -> None:
-        """Draw on top of an image from now on.
+        """Add the network's output to an image from now on.
 
         Args:
             image: ``[C, 64, 64]``, floats in [0, 1], such as the mean of all images.
@@ -312,7 +240,7 @@ class PixelDecoder(TensorDictModuleBase):
         """Write the reconstruction of the latent."""
         require_keys(tensordict, self.in_keys, "PixelDecoder")
         latent = tensordict.get(self.in_keys[0])
-        images = self.network(latent.reshape(-1, latent.shape[-1])).float()
+        images = self.network(latent.reshape(-1, latent.shape[-1])).to(latent.dtype)
         if self.background is not None:
             images = images + self.background
         return tensordict.set(self.out_keys[0], images.reshape(*latent.shape[:-1], *images.shape[-3:]))

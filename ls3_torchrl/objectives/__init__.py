@@ -1,5 +1,6 @@
 """One loss module per equation of the paper."""
 
+from ls3_torchrl.objectives.base import LatentLoss
 from ls3_torchrl.objectives.classifier import ClassifierLoss
 from ls3_torchrl.objectives.dynamics import EnsembleDynamicsLoss
 from ls3_torchrl.objectives.prediction import LatentPredictionLoss
@@ -10,6 +11,7 @@ from ls3_torchrl.objectives.value import OfflineValueLoss, TD1ValueLoss
 __all__ = [
     "ClassifierLoss",
     "EnsembleDynamicsLoss",
+    "LatentLoss",
     "LatentPredictionLoss",
     "OfflineValueLoss",
     "SafeSetLoss",

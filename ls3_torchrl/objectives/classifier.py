@@ -5,37 +5,38 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
-from torchrl.objectives import LossModule
 
-from ls3_torchrl._checks import require_keys
 from ls3_torchrl.modules.call import call_on_latent
-from ls3_torchrl.modules.classifiers import LatentClassifier
-from ls3_torchrl.objectives._common import as_scalars
+from ls3_torchrl.modules.classifiers import LatentClassifier, SafeSet
+from ls3_torchrl.objectives.base import LatentLoss
 
 
-class ClassifierLoss(LossModule):
+class ClassifierLoss(LatentLoss):
     """Binary cross-entropy of a latent classifier to a label of the state that was reached.
 
-    The defaults fit the constraint estimator; for the goal estimator use ``name="goal"`` and
-    ``set_keys(label=("next", "success"))``.
+    A :class:`~ls3_torchrl.modules.LatentClassifier` knows its name and its label. For any other module the label of
+    ``"goal"`` is ``("next", "success")``, and that of another name is ``("next", name)``.
 
     Args:
-        classifier: writes a logit.
-        name: the loss is returned as ``loss_{name}``.
+        classifier: any module whose first output is a logit ``[*B, 1]``.
+        name: the loss is returned as ``loss_{name}``; by default the classifier's own, or ``"constraint"``.
 
     Returns:
         The scalar ``loss_{name}`` and, detached, ``{name}_accuracy`` at probability one half.
 
     Raises:
+        TypeError: for a safe set, which has no labels.
+        ValueError: for labels of another shape than the logits.
         KeyError: when a key is missing.
 
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from ls3_torchrl.modules import GoalEstimator
-        >>> loss = ClassifierLoss(GoalEstimator(8), name="goal")
-        >>> loss.set_keys(label=("next", "success"))
+        >>> loss = ClassifierLoss(GoalEstimator(8))
         >>> reached = {"latent": torch.zeros(4, 8), "success": torch.ones(4, 1, dtype=torch.bool)}
         >>> loss(TensorDict({"next": reached}, [4]))["loss_goal"].backward()
     """
@@ -46,42 +47,38 @@ class ClassifierLoss(LossModule):
 
         Attributes:
             latent (NestedKey): the state to classify.
-            label (NestedKey): its label, bool ``[B, 1]``.
+            label (NestedKey): its label, bool ``[B, 1]``; the default is the classifier's own.
         """
 
         latent: NestedKey = ("next", "latent")
         label: NestedKey = ("next", "constraint")
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
+    classifier: TensorDictModuleBase
 
-    classifier: LatentClassifier
-
-    def __init__(self, classifier: LatentClassifier, *, name: str = "constraint") -> None:
+    def __init__(self, classifier: TensorDictModuleBase, *, name: str | None = None) -> None:
         super().__init__()
+        if isinstance(classifier, SafeSet):
+            raise TypeError(
+                f"{type(classifier).__name__} has no labels to learn from: its targets come from its own lagged copy. "
+                "Train it with SafeSetLoss."
+            )
         self.classifier = classifier
-        self.name = name
-        self.out_keys = [f"loss_{name}", f"{name}_accuracy"]
+        own_name, label = None, None
+        if isinstance(classifier, LatentClassifier):
+            own_name, label = classifier.name, classifier.label_key
+        self.name: str = name or own_name or "constraint"
+        self.out_keys = [f"loss_{self.name}", f"{self.name}_accuracy"]
+        if label is None:
+            label = ("next", "success" if self.name == "goal" else self.name)
+        self._start_from_keys(label=label)
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The keys that are read, as ``set_keys`` left them."""
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """Cross-entropy and accuracy on states ``[B]``."""
         keys = self.tensor_keys
-        return [keys.latent, keys.label]
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        pass
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The loss on states ``[B]``."""
-        keys = self.tensor_keys
-        require_keys(tensordict, self.in_keys, "ClassifierLoss")
         label = tensordict.get(keys.label)
         logit = call_on_latent(self.classifier, tensordict.get(keys.latent))
         hits = ((logit.detach() > 0) == label.bool()).float()
-        return as_scalars(
-            **{
-                f"loss_{self.name}": binary_cross_entropy_with_logits(logit, label.to(logit)),
-                f"{self.name}_accuracy": hits.mean(),
-            }
-        )
+        return {
+            f"loss_{self.name}": binary_cross_entropy_with_logits(logit, label.to(logit)),
+            f"{self.name}_accuracy": hits.mean(),
+        }

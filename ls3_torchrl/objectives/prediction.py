@@ -5,31 +5,31 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from torchrl.objectives import LossModule
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
-from ls3_torchrl._checks import require_keys
-from ls3_torchrl.modules.dynamics import EnsembleDynamics
-from ls3_torchrl.modules.vae import PixelEncoder
-from ls3_torchrl.objectives._common import as_scalars
+from ls3_torchrl.modules.call import encode
+from ls3_torchrl.objectives.base import LatentLoss
 
 
-class LatentPredictionLoss(LossModule):
+class LatentPredictionLoss(LatentLoss):
     """J(θ) = ‖μ(s_{t+1}) − f_dyn(μ(s_t), a_t)‖², with μ the mean of f_enc, averaged over batch, members and dimensions.
 
     Added to :class:`VAELoss`, it teaches the encoder and a dynamics model together. A VAE alone is content with any
     latents that tell images apart, and folds the few things that move into many dimensions; what the dynamics learn at
     one place then holds nowhere else. Not part of the paper, which trains the VAE by itself.
 
-    What a single image hardly shows, such as speed, shows several steps later: with K actions between the images, the
-    means of the dynamics are carried on over them, each member its own.
+    What a single image hardly shows, such as speed, shows several steps later: with K actions between the images, every
+    member of the dynamics is unrolled over them from its own means.
 
     The error shrinks with the latents' scale, which equation (1)'s KL term only partly holds up:
     :meth:`~ls3_torchrl.modules.PixelEncoder.rescale` gives them a unit scale again.
 
     Args:
-        encoder: writes the posterior's ``loc``; gets gradients through both images.
-        dynamics: every member learns from every row.
+        encoder: any module of one observation that writes ``loc`` or ``latent``; gets gradients through both images.
+        dynamics: :class:`~ls3_torchrl.modules.EnsembleDynamics`, of which every member learns from every row; or any
+            module of latent and action whose first output is the next latent.
 
     Returns:
         The scalar ``loss_prediction``.
@@ -64,36 +64,31 @@ class LatentPredictionLoss(LossModule):
         action: NestedKey = "action"
         next_pixels: NestedKey = ("next", "pixels")
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
+    encoder: TensorDictModuleBase
+    dynamics: TensorDictModuleBase
 
-    encoder: PixelEncoder
-    dynamics: EnsembleDynamics
-
-    def __init__(self, encoder: PixelEncoder, dynamics: EnsembleDynamics) -> None:
+    def __init__(self, encoder: TensorDictModuleBase, dynamics: TensorDictModuleBase) -> None:
         super().__init__()
         self.out_keys = ["loss_prediction"]
         self.encoder, self.dynamics = encoder, dynamics
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The keys that are read, as ``set_keys`` left them."""
-        keys = self.tensor_keys
-        return [keys.pixels, keys.action, keys.next_pixels]
+    def _predicted(self, latent: Tensor, actions: Tensor) -> Tensor:
+        """Every member's latent after the actions ``[B, K, A]``, ``[B, M or 1, D]``."""
+        if hasattr(self.dynamics, "unroll"):
+            return self.dynamics.unroll(latent, actions)[0][..., -1, :]
+        latent_key, action_key = self.dynamics.in_keys[:2]
+        for action in actions.unbind(-2):
+            step = TensorDict({latent_key: latent, action_key: action}, batch_size=latent.shape[:1])
+            latent = self.dynamics(step).get(self.dynamics.out_keys[0])
+        return latent.unsqueeze(-2)
 
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        pass
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The loss on images ``[B, C, 64, 64]`` and the action, or the K actions ``[B, K, A]``, between them."""
-        keys = self.tensor_keys
-        require_keys(tensordict, self.in_keys, "LatentPredictionLoss")
-        pixels, next_pixels = tensordict.get(keys.pixels), tensordict.get(keys.next_pixels)
-        both = tensordict.empty(batch_size=[2 * pixels.shape[0]])
-        both.set(self.encoder.pixels_key, torch.cat([pixels, next_pixels]))
-        latent, next_latent = self.encoder[0](both).get(self.encoder.loc_key).chunk(2)
-        actions = tensordict.get(keys.action)
+        pixels, actions, next_pixels = (tensordict.get(key) for key in self.in_keys)
+        both = torch.cat([pixels, next_pixels])
+        rows = TensorDict({self.encoder.in_keys[0]: both}, batch_size=both.shape[:1])
+        latent, next_latent = encode(self.encoder, rows)[0].chunk(2)
         if actions.ndim == latent.ndim:
             actions = actions.unsqueeze(-2)
-        predicted = self.dynamics.unroll(latent, actions)[0][..., -1, :]
-        return as_scalars(loss_prediction=(predicted - next_latent.unsqueeze(-2)).square().mean())
+        predicted = self._predicted(latent, actions)
+        return {"loss_prediction": (predicted - next_latent.unsqueeze(-2)).square().mean()}

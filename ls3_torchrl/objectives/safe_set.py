@@ -6,19 +6,16 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictParams
+from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
-from torchrl.objectives import LossModule
 
-from ls3_torchrl._checks import require_keys
+from ls3_torchrl._checks import require_unit_interval
 from ls3_torchrl.modules.call import call_on_latent
-from ls3_torchrl.modules.classifiers import SafeSet
-from ls3_torchrl.objectives._common import as_scalars
-from ls3_torchrl.objectives.value import check_discount
+from ls3_torchrl.objectives.base import LatentLoss
 
 
-class SafeSetLoss(LossModule):
+class SafeSetLoss(LatentLoss):
     """Binary cross-entropy of f_S(z_t) to max(1_S(z_t), γ_S f_S'(z_{t+1})) (equation (5)).
 
     Rows may carry a weight under ``weight``; those of a trajectory that neither succeeded nor violated, say, tell
@@ -28,7 +25,7 @@ class SafeSetLoss(LossModule):
     ``HardUpdate(loss, value_network_update_interval=99)`` for a copy every 100 updates.
 
     Args:
-        safe_set: writes the logit of f_S.
+        safe_set: any module whose first output is the logit ``[*B, 1]`` of f_S.
         gamma: γ_S in [0, 1] (Table 1: 0.3 for Navigation and Reacher, 0.9 for the others).
 
     Returns:
@@ -66,27 +63,17 @@ class SafeSetLoss(LossModule):
         in_success: NestedKey = "in_success"
         weight: NestedKey = "safe_set_weight"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
+    _optional = frozenset({"weight"})
 
-    safe_set: SafeSet
+    safe_set: TensorDictModuleBase
     safe_set_params: TensorDictParams
     target_safe_set_params: TensorDictParams
 
-    def __init__(self, safe_set: SafeSet, *, gamma: float = 0.3) -> None:
+    def __init__(self, safe_set: TensorDictModuleBase, *, gamma: float = 0.3) -> None:
         super().__init__()
         self.convert_to_functional(safe_set, "safe_set", create_target_params=True)
         self.out_keys = ["loss_safe_set"]
-        self.gamma = check_discount(gamma, "gamma (of the safe set)")
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The keys that must be there, as ``set_keys`` left them."""
-        keys = self.tensor_keys
-        return [keys.latent, keys.next_latent, keys.in_success]
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        pass
+        self.gamma = require_unit_interval(gamma, "gamma (of the safe set)")
 
     def target(self, next_latent: Tensor, in_success: Tensor) -> Tensor:
         """max(1_S(z_t), γ_S f_S'(z_{t+1})), a probability ``[B, 1]``."""
@@ -94,11 +81,10 @@ class SafeSetLoss(LossModule):
             next_safe = call_on_latent(self.safe_set, next_latent, params=self.target_safe_set_params).sigmoid()
         return torch.maximum(in_success.to(next_safe), self.gamma * next_safe)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The loss on transitions ``[B]``."""
         keys = self.tensor_keys
-        require_keys(tensordict, self.in_keys, "SafeSetLoss")
         target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.in_success))
         weight = tensordict.get(keys.weight, None)
         logit = call_on_latent(self.safe_set, tensordict.get(keys.latent), params=self.safe_set_params)
-        return as_scalars(loss_safe_set=binary_cross_entropy_with_logits(logit, target, weight))
+        return {"loss_safe_set": binary_cross_entropy_with_logits(logit, target, weight)}

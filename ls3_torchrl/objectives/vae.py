@@ -6,22 +6,24 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from torch.distributions import Normal, kl_divergence
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torch.distributions import Normal
 from torch.nn.functional import mse_loss
-from torchrl.objectives import LossModule
 
-from ls3_torchrl._checks import require_choice, require_keys
-from ls3_torchrl.modules.vae import PixelDecoder, PixelEncoder, as_unit_pixels
-from ls3_torchrl.objectives._common import as_scalars
+from ls3_torchrl._checks import require_choice
+from ls3_torchrl.modules.call import call_on_latent, encode, posterior_keys
+from ls3_torchrl.modules.vae import PixelEncoder, as_unit_pixels
+from ls3_torchrl.objectives.base import LatentLoss
 
 
-class VAELoss(LossModule):
+class VAELoss(LatentLoss):
     """J(θ) = ‖f_dec(z) − s‖² + β · KL(f_enc(z|s) ‖ N(0, 1)) with a reparameterised z (equation (1)).
 
     Args:
-        encoder: writes ``loc`` and ``scale`` of the posterior.
-        decoder: latents to images.
+        encoder: any module of one image that writes ``loc`` and ``scale`` of the posterior.
+        decoder: any module of the latent whose first output is the image.
         beta: β, at least 0 (Table 1: 1e-6).
         reduction: ``"mean"`` averages the squared error over pixels and the KL over latent dimensions, as the
             authors' code does and as Table 1's β is meant; ``"sum"`` is equation (1) to the letter. Both then
@@ -31,7 +33,8 @@ class VAELoss(LossModule):
         Scalars ``loss_vae`` (what to minimise), and detached ``reconstruction`` and ``kl``.
 
     Raises:
-        ValueError: for a negative β or an unknown reduction.
+        ValueError: for a negative β, an unknown reduction, an encoder without ``scale``, or reconstructions of another
+            shape than the images.
         KeyError: when images are missing.
 
     Example:
@@ -55,16 +58,13 @@ class VAELoss(LossModule):
         pixels: NestedKey = "pixels"
         target: NestedKey | None = None
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
-    encoder: PixelEncoder
-    decoder: PixelDecoder
+    encoder: TensorDictModuleBase
+    decoder: TensorDictModuleBase
 
     def __init__(
         self,
-        encoder: PixelEncoder,
-        decoder: PixelDecoder,
+        encoder: TensorDictModuleBase,
+        decoder: TensorDictModuleBase,
         *,
         beta: float = 1e-6,
         reduction: Literal["mean", "sum"] = "mean",
@@ -72,47 +72,60 @@ class VAELoss(LossModule):
         super().__init__()
         if beta < 0:
             raise ValueError(f"beta must not be negative, got {beta}.")
+        if posterior_keys(encoder)[1] is None:
+            raise ValueError(
+                "VAELoss needs an encoder that writes mean and standard deviation of its posterior, as 'loc' and "
+                f"'scale'; {type(encoder).__name__} writes {encoder.out_keys}. Add a standard deviation, or train it "
+                "with LatentPredictionLoss, which needs none."
+            )
         self.encoder, self.decoder = encoder, decoder
         self.out_keys = ["loss_vae", "reconstruction", "kl"]
         self.beta = beta
         self.reduction = require_choice(reduction, ("mean", "sum"), "reduction")
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The keys that are read, as ``set_keys`` left them."""
-        keys = self.tensor_keys
-        return [keys.pixels] if keys.target is None else [keys.pixels, keys.target]
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        pass
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The loss on images ``[B, C, 64, 64]``."""
         keys = self.tensor_keys
-        target_key = keys.pixels if keys.target is None else keys.target
-        require_keys(tensordict, self.in_keys, "VAELoss")
         pixels = tensordict.get(keys.pixels)
-        target = as_unit_pixels(tensordict.get(target_key), pixels.shape[-3])
+        target = as_unit_pixels(pixels if keys.target is None else tensordict.get(keys.target), self._dtype())
+        if keys.target in (None, keys.pixels) and type(self.encoder) is PixelEncoder:
+            # Floats in [0, 1] are as good to it; the same images need not be converted twice.
+            pixels = target
+        rows = TensorDict({self.encoder.in_keys[0]: pixels}, batch_size=pixels.shape[:1])
+        loc, scale = encode(self.encoder, rows)
+        reconstruction = call_on_latent(self.decoder, Normal(loc, scale).rsample())
+        if reconstruction.shape != target.shape:
+            raise ValueError(
+                f"The decoder writes images of shape {list(reconstruction.shape)} where the images to reconstruct have "
+                f"shape {list(target.shape)}. Build encoder and decoder for the same images."
+            )
 
-        params = tensordict.empty()
-        # Floats in [0, 1] are as good to the encoder; the same images need not be converted twice.
-        params.set(self.encoder.pixels_key, target if target_key == keys.pixels else pixels)
-        self.encoder[0](params)
-        posterior = Normal(params.get(self.encoder.loc_key), params.get(self.encoder.scale_key))
-        params.set(self.decoder.in_keys[0], posterior.rsample())
-        reconstruction = self.decoder(params).get(self.decoder.out_keys[0])
-
+        kl = _kl_to_standard_normal(loc, scale)
         # No clamp on the reconstruction: it would stop the gradient of every pixel that starts below zero.
-        kl = kl_divergence(posterior, Normal(torch.zeros_like(posterior.loc), torch.ones_like(posterior.scale)))
         if self.reduction == "mean":
-            # Channels last, as the images lie: PyTorch's gradient would come in another order than they.
-            error = mse_loss(reconstruction.movedim(-3, -1), target.movedim(-3, -1))
+            if target.ndim > 2:
+                # Channels last, as the images lie: PyTorch's gradient would come in another order than they.
+                reconstruction, target = reconstruction.movedim(-3, -1), target.movedim(-3, -1)
+            error = mse_loss(reconstruction, target)
             divergence = kl.mean()
         else:
             error = mse_loss(reconstruction, target, reduction="sum") / kl[..., 0].numel()
             divergence = kl.sum(-1).mean()
-        return as_scalars(
-            loss_vae=error + self.beta * divergence,
-            reconstruction=error.detach(),
-            kl=divergence.detach(),
-        )
+        return {
+            "loss_vae": error + self.beta * divergence,
+            "reconstruction": error.detach(),
+            "kl": divergence.detach(),
+        }
+
+    def _dtype(self) -> torch.dtype:
+        """The dtype that the decoder computes in."""
+        return next((p.dtype for p in self.decoder.parameters()), torch.float32)
+
+
+def _kl_to_standard_normal(loc: Tensor, scale: Tensor) -> Tensor:
+    """KL(N(loc, scale²) ‖ N(0, 1)) of each dimension.
+
+    ``torch.distributions.kl_divergence`` is not used: the compiler cannot trace how it looks its formula up.
+    """
+    variance = scale.pow(2)
+    return 0.5 * (variance + loc.pow(2) - 1 - variance.log())

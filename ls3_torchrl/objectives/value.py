@@ -6,39 +6,31 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictParams
+from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
-from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import td0_return_estimate
 
-from ls3_torchrl._checks import require_keys
+from ls3_torchrl._checks import require_unit_interval
 from ls3_torchrl.modules.call import call_on_latent
-from ls3_torchrl.modules.value import ValueEnsemble
-from ls3_torchrl.objectives._common import as_scalars, check_members
+from ls3_torchrl.objectives.base import LatentLoss, check_members, require_ensemble, with_members
 
 
-def check_discount(gamma: float, name: str = "gamma") -> float:
-    """Return a discount factor in [0, 1]; raise ``ValueError`` for another."""
-    if not 0.0 <= gamma <= 1.0:
-        raise ValueError(f"{name} must lie in [0, 1], got {gamma}.")
-    return float(gamma)
-
-
-class OfflineValueLoss(LossModule):
+class OfflineValueLoss(LatentLoss):
     """J(θ) = (V_θ(z_t) − Σ_{i≥0} γ^i r_{t+i})² over batch and members (equation (3)).
 
     Deviation: the paper's sum starts at i = 1. It starts at 0 here, so that it agrees with equation (4) and
     the switch from one loss to the other moves nothing.
 
     Args:
-        value: the ensemble.
-        bootstrap: the batch is ``[B, M]`` and member m learns from column m alone.
+        value: any module of the latent whose first output is the value ``[*B, 1]``, or ``[*B, M, 1]`` of M members.
+        bootstrap: the batch is ``[B, M]`` and member m learns from column m alone; the value must be an ensemble.
 
     Returns:
         The scalar ``loss_value``.
 
     Raises:
-        ValueError: when a bootstrap batch has not M columns.
+        TypeError: for ``bootstrap`` without an ensemble.
+        ValueError: when a bootstrap batch has not M columns, or values and targets do not fit.
         KeyError: when a key is missing.
 
     Example:
@@ -62,40 +54,29 @@ class OfflineValueLoss(LossModule):
         latent: NestedKey = "latent"
         reward_to_go: NestedKey = "reward_to_go"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
+    value: TensorDictModuleBase
 
-    value: ValueEnsemble
-
-    def __init__(self, value: ValueEnsemble, *, bootstrap: bool = False) -> None:
+    def __init__(self, value: TensorDictModuleBase, *, bootstrap: bool = False) -> None:
         super().__init__()
+        if bootstrap:
+            require_ensemble(value, "OfflineValueLoss")
         self.out_keys = ["loss_value"]
         self.value = value
         self.bootstrap = bootstrap
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The keys that are read, as ``set_keys`` left them."""
-        keys = self.tensor_keys
-        return [keys.latent, keys.reward_to_go]
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        pass
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The loss on states ``[B]``, or ``[B, M]`` with ``bootstrap``."""
         keys = self.tensor_keys
-        require_keys(tensordict, self.in_keys, "OfflineValueLoss")
-        latent, target = tensordict.get(keys.latent), tensordict.get(keys.reward_to_go)
+        latent = tensordict.get(keys.latent)
         if self.bootstrap:
-            check_members(latent, self.value.num_members, "OfflineValueLoss")
-        else:
-            target = target.unsqueeze(-2)
-        value = call_on_latent(self.value, latent, per_member=self.bootstrap)
-        return as_scalars(loss_value=(value - target).square().mean())
+            check_members(latent, self.value, "OfflineValueLoss")
+        options = {"per_member": True} if self.bootstrap else {}
+        value = call_on_latent(self.value, latent, **options)
+        target = with_members(tensordict.get(keys.reward_to_go), value, "OfflineValueLoss")
+        return {"loss_value": (value - target).square().mean()}
 
 
-class TD1ValueLoss(LossModule):
+class TD1ValueLoss(LatentLoss):
     """J(θ) = (V_θ(z_t) − (r_t + γ V_θ'(z_{t+1})))² with a lagged target θ' (equation (4)).
 
     No ``done`` mask: episodes end only by the horizon (section 1.1.1). Each member bootstraps from its own
@@ -103,7 +84,7 @@ class TD1ValueLoss(LossModule):
     updates.
 
     Args:
-        value: the ensemble.
+        value: any module of the latent whose first output is the value ``[*B, 1]``, or ``[*B, M, 1]`` of M members.
         gamma: γ in [0, 1] (Table 1: 0.99).
         zero_at_goal: the target is 0 where the reward is 0, since the agent may stay in the goal set; this is
             what the authors' code does.
@@ -112,13 +93,14 @@ class TD1ValueLoss(LossModule):
             value of acting well from below, so that failures nearby do not wash out what demonstrations have shown.
             The labels of failed episodes must not end with the horizon
             (``TaggedReplayBuffer(continue_failures=True)``). ``False`` is the paper.
-        bootstrap: the batch is ``[B, M]`` and member m learns from column m alone.
+        bootstrap: the batch is ``[B, M]`` and member m learns from column m alone; the value must be an ensemble.
 
     Returns:
         The scalar ``loss_value``.
 
     Raises:
-        ValueError: for γ outside [0, 1] or a bootstrap batch without M columns.
+        TypeError: for ``bootstrap`` without an ensemble.
+        ValueError: for γ outside [0, 1], a bootstrap batch without M columns, or values and targets that do not fit.
         KeyError: when a key is missing.
 
     Example:
@@ -149,16 +131,13 @@ class TD1ValueLoss(LossModule):
         reward: NestedKey = ("next", "reward")
         reward_to_go: NestedKey = "reward_to_go"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
-    value: ValueEnsemble
+    value: TensorDictModuleBase
     value_params: TensorDictParams
     target_value_params: TensorDictParams
 
     def __init__(
         self,
-        value: ValueEnsemble,
+        value: TensorDictModuleBase,
         *,
         gamma: float = 0.99,
         zero_at_goal: bool = True,
@@ -166,46 +145,37 @@ class TD1ValueLoss(LossModule):
         bootstrap: bool = False,
     ) -> None:
         super().__init__()
+        if bootstrap:
+            require_ensemble(value, "TD1ValueLoss")
         self.convert_to_functional(value, "value", create_target_params=True)
         self.out_keys = ["loss_value"]
-        self.num_members = value.num_members
-        self.gamma = check_discount(gamma)
+        self.gamma = require_unit_interval(gamma, "gamma")
         self.zero_at_goal = zero_at_goal
         self.monte_carlo = monte_carlo
         self.bootstrap = bootstrap
+        self._optional = frozenset() if monte_carlo else frozenset({"reward_to_go"})
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The keys that are read, as ``set_keys`` left them."""
-        keys = self.tensor_keys
-        always = [keys.latent, keys.next_latent, keys.reward]
-        return [*always, keys.reward_to_go] if self.monte_carlo else always
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        pass
+    def _values(self, latent: Tensor, params: TensorDictParams) -> Tensor:
+        options = {"per_member": True} if self.bootstrap else {}
+        return call_on_latent(self.value, latent, params=params, **options)
 
     def target(self, next_latent: Tensor, reward: Tensor) -> Tensor:
-        """r_t + γ V_θ'(z_{t+1}) of every member, ``[B, M, 1]``."""
+        """r_t + γ V_θ'(z_{t+1}), ``[B, 1]``, or ``[B, M, 1]`` of every member."""
         with torch.no_grad():
-            next_value = call_on_latent(
-                self.value, next_latent, params=self.target_value_params, per_member=self.bootstrap
-            )
-        reward = reward if self.bootstrap else reward.unsqueeze(-2)
-        reward = reward.expand_as(next_value)
+            next_value = self._values(next_latent, self.target_value_params)
+        reward = with_members(reward, next_value, "TD1ValueLoss").expand_as(next_value)
         never = torch.zeros_like(reward, dtype=torch.bool)
         target = td0_return_estimate(self.gamma, next_value, reward, terminated=never)
         return torch.where(reward == 0, torch.zeros_like(target), target) if self.zero_at_goal else target
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The loss on transitions ``[B]``, or ``[B, M]`` with ``bootstrap``."""
         keys = self.tensor_keys
-        require_keys(tensordict, self.in_keys, "TD1ValueLoss")
         latent = tensordict.get(keys.latent)
         if self.bootstrap:
-            check_members(latent, self.num_members, "TD1ValueLoss")
+            check_members(latent, self.value, "TD1ValueLoss")
         target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.reward))
         if self.monte_carlo:
-            seen = tensordict.get(keys.reward_to_go)
-            target = torch.maximum(target, seen if self.bootstrap else seen.unsqueeze(-2))
-        value = call_on_latent(self.value, latent, params=self.value_params, per_member=self.bootstrap)
-        return as_scalars(loss_value=(value - target).square().mean())
+            target = torch.maximum(target, with_members(tensordict.get(keys.reward_to_go), target, "TD1ValueLoss"))
+        value = self._values(latent, self.value_params)
+        return {"loss_value": (value - target).square().mean()}

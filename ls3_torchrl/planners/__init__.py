@@ -1,21 +1,24 @@
 """Planning: the learned model as an environment, the optimiser, the scores, and LS³'s controller."""
 
-from ls3_torchrl.planners.cem import CEMResult, CrossEntropyMethod, PlanScores
+from ls3_torchrl.planners.cem import CrossEntropyMethod
+from ls3_torchrl.planners.decisions import describe_plan
 from ls3_torchrl.planners.fused import FusedImagination
 from ls3_torchrl.planners.imagination import ImaginationNoise, Limits, PlanNoise, RolloutImagination
 from ls3_torchrl.planners.latent_env import LatentEnv
-from ls3_torchrl.planners.ls3 import LS3Planner, describe_plan
+from ls3_torchrl.planners.ls3 import LS3Planner
+from ls3_torchrl.planners.optimizer import Optimizer, OptimizerResult, PlanScores
 from ls3_torchrl.planners.scoring import PlanStatistics, feasible, least_harm, objective
 from ls3_torchrl.planners.warm_start import WarmStart
 
 __all__ = [
-    "CEMResult",
     "CrossEntropyMethod",
     "FusedImagination",
     "ImaginationNoise",
     "LS3Planner",
     "LatentEnv",
     "Limits",
+    "Optimizer",
+    "OptimizerResult",
     "PlanNoise",
     "PlanScores",
     "PlanStatistics",

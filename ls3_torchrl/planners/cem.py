@@ -2,82 +2,83 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple, Protocol
+import inspect
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ls3_torchrl._checks import require_at_least
+from ls3_torchrl.planners.optimizer import NoiseSource, Optimizer, OptimizerResult, PlanScores, ScorePlans
 
 
-class PlanScores(NamedTuple):
-    """What the caller says of a iteration of b × N sequences, each field ``[b, N]``.
-
-    Attributes:
-        score: the objective; NaN ranks last.
-        feasible: bool, whether the sequence may be carried out.
-        fallback: ranking for rows in which nothing is feasible.
-    """
-
-    score: Tensor
-    feasible: Tensor
-    fallback: Tensor
-
-
-class ScorePlans(Protocol):
-    """Judges candidate sequences."""
-
-    def __call__(self, actions: Tensor, rows: Tensor, restarts: Tensor, iteration: int) -> PlanScores:
-        """Judge ``actions`` ``[b, N, H, A]`` of batch rows ``rows`` ``[b]``, restarted ``restarts`` ``[b]`` times."""
-
-
-#: Draws the noise of one iteration: (rows ``[b]``, iteration) -> standard normal and uniform in [0, 1), each
-#: ``[b, N, H, A]``; the uniform one covers the first ``num_random + num_constant`` candidates at least.
-CandidateNoise = Callable[[Tensor, int], tuple[Tensor, Tensor]]
-
-
-class CEMResult(NamedTuple):
-    """The outcome for B rows.
+class _Elites(NamedTuple):
+    """The best feasible sequences of b rows.
 
     Attributes:
-        actions: the best sequence that was scored, ``[B, H, A]``.
-        score: its score, ``[B]``; for a fallback its fallback ranking.
-        mean: mean of the last elites, ``[B, H, A]``.
-        std: their standard deviation, ``[B, H, A]``.
-        restarts: how often each row started again, int64 ``[B]``.
-        fallback: bool ``[B]``, nothing feasible was ever found.
-        iterations: how many iterations each row had scored, int64 ``[B]``.
+        actions: best first, ``[b, E, H, A]``; where fewer are feasible, the rest is filled up with others.
+        score: ``[b, E]``, −∞ for those that fill up.
+        any: bool ``[b]``, whether anything is feasible.
     """
 
     actions: Tensor
     score: Tensor
+    any: Tensor
+
+
+@dataclass
+class _Search:
+    """How far the search of B rows has come; the first dimension of every field is B."""
+
+    start_mean: Tensor
+    start_std: Tensor
     mean: Tensor
     std: Tensor
+    best: Tensor
+    best_score: Tensor
+    #: Rounds done since the last start.
+    step: Tensor
     restarts: Tensor
-    fallback: Tensor
     iterations: Tensor
+    #: Whether a feasible sequence was ever found.
+    found: Tensor
+
+    @classmethod
+    def begin(cls, mean: Tensor, std: Tensor) -> _Search:
+        """Nothing is known but the Gaussian, ``[B, H, A]`` each, that the first round samples."""
+        score = torch.full(mean.shape[:1], -torch.inf, device=mean.device)
+        count = torch.zeros_like(score, dtype=torch.long)
+        best, found = torch.zeros(mean.shape, device=mean.device), torch.zeros_like(score, dtype=torch.bool)
+        return cls(mean, std, mean.clone(), std.clone(), best, score, count, count.clone(), count.clone(), found)
+
+    def result(self) -> OptimizerResult:
+        """What was found."""
+        return OptimizerResult(
+            self.best, self.best_score, self.mean, self.std, self.restarts, ~self.found, self.iterations
+        )
 
 
 class CrossEntropyMethod:
-    """Sample, score, keep the elites, refit; for a batch of independent problems side by side.
+    """Sample, score, keep the elites, refit; for a batch of independent rows side by side.
 
     In the first round ``p_random`` of the candidates are uniform in the box, ``p_constant`` of them hold one
     uniform action, and the rest come from the given Gaussian; later rounds sample the refitted one, clamped to
     the box. A row in which nothing is feasible starts again from its first round, up to ``max_restarts`` times;
     after that it takes the sequence with the best fallback ranking (unless an earlier round had found a feasible
-    one). The outcome is the best sequence that was scored: no iteration is drawn without being scored.
+    one). The outcome is the best sequence that was scored: no iteration is sampled without being scored.
+
+    An :class:`~ls3_torchrl.planners.Optimizer`; the defaults are Table 1's.
 
     Args:
         num_candidates: N.
         num_elites: sequences that the Gaussian is refitted on, 1 to N; fewer where fewer are feasible.
-        optim_steps: rounds, each scored.
-        max_restarts: how often a row may start again.
-        p_random: share of uniform candidates in the first round, in [0, 1].
-        p_constant: share of candidates in the first round that hold one uniform action over the whole horizon.
+        optim_steps: rounds, each scored. Table 1's n_cem_iters = 5 samples five iterations and scores four.
+        p_random: fraction of uniform candidates in the first round, in [0, 1].
+        p_constant: fraction of candidates in the first round that hold one uniform action over the whole horizon.
             Actions drawn independently step by step mostly cancel; a way that has to be kept up is found among
             correlated ones (as in Pinneri et al. 2020, arXiv 2008.06389). 0 is the paper.
-        min_std: floor of the refitted standard deviation as a share of the box's side; 0 is the paper.
+        min_std: floor of the refitted standard deviation as a fraction of the box's side; 0 is the paper.
 
     Raises:
         ValueError: for settings out of range.
@@ -97,10 +98,9 @@ class CrossEntropyMethod:
     def __init__(
         self,
         *,
-        num_candidates: int,
-        num_elites: int,
-        optim_steps: int,
-        max_restarts: int = 5,
+        num_candidates: int = 1000,
+        num_elites: int = 100,
+        optim_steps: int = 4,
         p_random: float = 1.0,
         p_constant: float = 0.0,
         min_std: float = 0.0,
@@ -115,11 +115,10 @@ class CrossEntropyMethod:
                 f"p_constant must lie in [0, 1] and leave room for p_random, got p_constant={p_constant} and "
                 f"p_random={p_random}: together they must not exceed 1."
             )
-        if min_std < 0.0:
+        if not min_std >= 0.0:
             raise ValueError(f"min_std must not be negative, got {min_std}.")
         self.num_elites = num_elites
         self.optim_steps = require_at_least(optim_steps, 1, "optim_steps")
-        self.max_restarts = require_at_least(max_restarts, 0, "max_restarts")
         self.p_random = p_random
         self.p_constant = p_constant
         self.min_std = min_std
@@ -135,12 +134,16 @@ class CrossEntropyMethod:
         return min(round(self.p_constant * self.num_candidates), self.num_candidates - self.num_random)
 
     @property
-    def max_iterations(self) -> int:
-        """The most iterations that a row can score."""
-        return self.optim_steps * (self.max_restarts + 1)
+    def uses_warm_start(self) -> bool:
+        """Whether some candidates of a first round are drawn from the given Gaussian."""
+        return self.num_random + self.num_constant < self.num_candidates
 
-    def draw(self, rows: Tensor, horizon: int, action_dim: int) -> tuple[Tensor, Tensor]:
-        """Fresh candidate noise from torch's global generator, standard normal and uniform."""
+    def max_iterations(self, max_restarts: int) -> int:
+        """The most iterations that a row can score."""
+        return self.optim_steps * (max_restarts + 1)
+
+    def sample_noise(self, rows: Tensor, horizon: int, action_dim: int) -> tuple[Tensor, Tensor]:
+        """Noise of one iteration, standard normal and uniform in [0, 1), each ``[b, N, H, A]``."""
         shape = (rows.numel(), self.num_candidates, horizon, action_dim)
         return torch.randn(shape, device=rows.device), torch.rand(shape, device=rows.device)
 
@@ -152,83 +155,121 @@ class CrossEntropyMethod:
         *,
         batch: int,
         horizon: int,
+        max_restarts: int = 0,
         mean: Tensor | None = None,
         std: Tensor | None = None,
-        noise: CandidateNoise | None = None,
-    ) -> CEMResult:
-        """Optimise ``batch`` sequences of ``horizon`` actions in the box.
-
-        Args:
-            score_plans: judges candidates.
-            low: lower bounds ``[A]``.
-            high: upper bounds ``[A]``.
-            batch: B.
-            horizon: H.
-            mean: mean of the first rounds' Gaussian, ``[B, H, A]``; the box's middle when ``None``.
-            std: its standard deviation; a quarter of the box's side when ``None``.
-            noise: source of candidate noise; fresh draws when ``None``.
-        """
-        device, shape = low.device, (batch, horizon, low.shape[-1])
-        side = high - low
-        start_mean = ((low + high) / 2).expand(shape) if mean is None else mean
-        start_std = (side / 4).expand(shape) if std is None else std
-        mean, std = start_mean.clone(), start_std.clone()
-        best = torch.zeros(shape, device=device)
-        best_score = torch.full((batch,), -torch.inf, device=device)
-        step = torch.zeros(batch, dtype=torch.long, device=device)
-        restarts, iterations = torch.zeros_like(step), torch.zeros_like(step)
-        found = torch.zeros(batch, dtype=torch.bool, device=device)
-        index = torch.arange(self.num_candidates, device=device)
-        uniform_first = index < self.num_random + self.num_constant
-        constant = (uniform_first & (index >= self.num_random))[:, None, None]
-
-        rows = torch.arange(batch, device=device)
-        iteration = 0
+        noise: NoiseSource | None = None,
+    ) -> OptimizerResult:
+        """Optimise ``batch`` sequences of ``horizon`` actions in the box; see :class:`Optimizer` for the arguments."""
+        require_at_least(max_restarts, 0, "max_restarts")
+        low, high = low.float(), high.float()
+        shape = (batch, horizon, low.shape[-1])
+        search = _Search.begin(
+            ((low + high) / 2).expand(shape) if mean is None else mean.float(),
+            ((high - low) / 4).expand(shape) if std is None else std.float(),
+        )
+        rows, iteration = torch.arange(batch, device=low.device), 0
         while rows.numel():
-            normal, uniform = self.draw(rows, horizon, shape[-1]) if noise is None else noise(rows, iteration)
-            actions = mean[rows, None] + std[rows, None] * normal
-            if self.num_constant:
-                uniform = torch.where(constant, uniform[..., :1, :], uniform)
-            is_uniform = (step[rows] == 0)[:, None] & uniform_first
-            actions = torch.where(is_uniform[..., None, None], low + side * uniform, actions)
-            actions = actions.clamp(low, high)
-
-            score, allowed, fallback = score_plans(actions, rows, restarts[rows], iteration)
-            iterations[rows] += 1
-            allowed = allowed & (score > -torch.inf)  # False for NaN too
-            score = score.masked_fill(~allowed, -torch.inf)
-            elite_score, elite = score.topk(self.num_elites, dim=-1)
-            any_allowed = allowed.any(-1)
-
-            top = actions.gather(1, elite[..., None, None].expand(-1, -1, *actions.shape[2:]))
-            weight = (elite_score > -torch.inf).to(actions)[..., None, None]
-            weight = weight / weight.sum(1, keepdim=True).clamp(min=1.0)
-            elite_mean = (weight * top).sum(1)
-            elite_std = (weight * (top - elite_mean[:, None]).square()).sum(1).sqrt()
-
-            good = rows[any_allowed]
-            mean[good] = elite_mean[any_allowed]
-            std[good] = torch.maximum(elite_std[any_allowed], self.min_std * side)
-            better = any_allowed & (elite_score[:, 0] > best_score[rows])
-            best[rows[better]] = top[better, 0]
-            best_score[rows[better]] = elite_score[better, 0]
-            found[good] = True
-            step[good] += 1
-
-            none = rows[~any_allowed]
-            exhausted = restarts[none] >= self.max_restarts
-            again, lost = none[~exhausted], none[exhausted & ~found[none]]
-            restarts[again] += 1
-            step[again] = 0
-            mean[again], std[again] = start_mean[again], start_std[again]
-            step[none[exhausted]] = self.optim_steps  # these rows are done
-            if lost.numel():
-                position = torch.isin(rows, lost).nonzero().flatten()
-                harm = fallback[position].nan_to_num(nan=-torch.inf)
-                choice = harm.argmax(-1)
-                best[lost] = actions[position, choice]
-                best_score[lost] = harm.gather(-1, choice[:, None]).squeeze(-1)
-                mean[lost], std[lost] = best[lost], start_std[lost]
-            rows = rows[step[rows] < self.optim_steps]
+            drawn = self.sample_noise(rows, *shape[1:]) if noise is None else noise(rows, iteration)
+            actions = self._candidates(search, rows, drawn, low, high)
+            scores = score_plans(actions, rows, search.restarts[rows], iteration)
+            search.iterations[rows] += 1
+            elites = self._select(actions, scores)
+            self._refit(search, rows, elites, self.min_std * (high - low))
+            self._restart(search, rows, elites.any, max_restarts, actions, scores.fallback)
+            rows = rows[search.step[rows] < self.optim_steps]
             iteration += 1
-        return CEMResult(best, best_score, mean, std, restarts, ~found, iterations)
+        return search.result()
+
+    def _candidates(
+        self, search: _Search, rows: Tensor, noise: tuple[Tensor, ...], low: Tensor, high: Tensor
+    ) -> Tensor:
+        """Sequences ``[b, N, H, A]`` to score next: round the Gaussian, and in a first round uniform and held ones."""
+        normal, uniform = noise
+        index = torch.arange(self.num_candidates, device=low.device)
+        uniform_first = index < self.num_random + self.num_constant
+        actions = search.mean[rows, None] + search.std[rows, None] * normal
+        if self.num_constant:
+            held = uniform_first & (index >= self.num_random)
+            uniform = torch.where(held[:, None, None], uniform[..., :1, :], uniform)
+        is_uniform = (search.step[rows] == 0)[:, None] & uniform_first
+        actions = torch.where(is_uniform[..., None, None], low + (high - low) * uniform, actions)
+        return actions.clamp(low, high)
+
+    def _select(self, actions: Tensor, scores: PlanScores) -> _Elites:
+        """The best feasible candidates of each row."""
+        score = scores.score.float()
+        feasible = scores.feasible & (score > -torch.inf)  # False for NaN too
+        score, elite = score.masked_fill(~feasible, -torch.inf).topk(self.num_elites, dim=-1)
+        best = actions.gather(1, elite[..., None, None].expand(-1, -1, *actions.shape[2:]))
+        return _Elites(best, score, feasible.any(-1))
+
+    def _refit(self, search: _Search, rows: Tensor, elites: _Elites, min_std: Tensor) -> None:
+        """Rows with elites: the Gaussian is refitted on them, and the best sequence so far is kept."""
+        weight = (elites.score > -torch.inf).to(elites.actions)[..., None, None]
+        weight = weight / weight.sum(1, keepdim=True).clamp(min=1.0)
+        mean = (weight * elites.actions).sum(1)
+        std = (weight * (elites.actions - mean[:, None]).square()).sum(1).sqrt()
+
+        good = rows[elites.any]
+        search.mean[good] = mean[elites.any]
+        search.std[good] = torch.maximum(std[elites.any], min_std)
+        search.found[good] = True
+        search.step[good] += 1
+        better = elites.any & (elites.score[:, 0] > search.best_score[rows])
+        search.best[rows[better]] = elites.actions[better, 0]
+        search.best_score[rows[better]] = elites.score[better, 0]
+
+    def _restart(
+        self, search: _Search, rows: Tensor, any_feasible: Tensor, max_restarts: int, actions: Tensor, fallback: Tensor
+    ) -> None:
+        """Rows without elites: they start again, or are done when they have done so ``max_restarts`` times."""
+        position = (~any_feasible).nonzero().flatten()
+        none = rows[position]
+        exhausted = search.restarts[none] >= max_restarts
+        again = none[~exhausted]
+        search.restarts[again] += 1
+        search.step[again] = 0
+        search.mean[again], search.std[again] = search.start_mean[again], search.start_std[again]
+        search.step[none[exhausted]] = self.optim_steps
+        lost = position[exhausted & ~search.found[none]]
+        if lost.numel():
+            self._fall_back(search, rows[lost], actions[lost], fallback[lost].float())
+
+    def _fall_back(self, search: _Search, rows: Tensor, actions: Tensor, fallback: Tensor) -> None:
+        """Rows in which nothing was ever feasible take the candidate that ranks best, as wide as they began."""
+        ranking = fallback.nan_to_num(nan=-torch.inf)
+        choice = ranking.argmax(-1)
+        search.best[rows] = actions[torch.arange(len(rows), device=rows.device), choice]
+        search.best_score[rows] = ranking.gather(-1, choice[:, None]).squeeze(-1)
+        search.mean[rows], search.std[rows] = search.best[rows], search.start_std[rows]
+
+
+def optimizer_or_default(optimizer: Optimizer | None, settings: dict[str, Any], *, owner: type) -> Optimizer:
+    """The given optimiser, or the cross-entropy method with ``settings``; what fits neither is refused by name.
+
+    Args:
+        optimizer: the user's, if any.
+        settings: what the user passed to ``owner`` beside its own settings.
+        owner: class whose settings the message lists.
+    """
+    known = list(inspect.signature(CrossEntropyMethod).parameters)
+    unknown = [name for name in settings if name not in known]
+    if unknown:
+        own = [name for name, p in inspect.signature(owner).parameters.items() if p.kind is not p.VAR_KEYWORD]
+        raise TypeError(
+            f"{owner.__name__} knows no setting {', '.join(unknown)}. Its own are {', '.join(own)}; those of its "
+            f"optimiser, CrossEntropyMethod, are {', '.join(known)}."
+        )
+    if optimizer is None:
+        return CrossEntropyMethod(**settings)
+    if settings:
+        raise TypeError(
+            f"{', '.join(settings)} are settings of the optimiser: give them to {type(optimizer).__name__}, which was "
+            "passed as optimizer."
+        )
+    if not isinstance(optimizer, Optimizer):
+        needed = ("num_candidates", "uses_warm_start", "max_iterations", "sample_noise", "__call__")
+        missing = [name for name in needed if not hasattr(optimizer, name)]
+        raise TypeError(f"optimizer must be an Optimizer; {type(optimizer).__name__} lacks {', '.join(missing)}.")
+    return optimizer

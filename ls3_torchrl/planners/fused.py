@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cached_property, lru_cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from ls3_torchrl._checks import require_choice
-from ls3_torchrl.modules.classifiers import LatentClassifier
-from ls3_torchrl.modules.ensemble import EnsembleMLP
-from ls3_torchrl.modules.value import ValueEnsemble
+from ls3_torchrl.layers import Precision, run_layers
+from ls3_torchrl.planners.fusable import require_fusable, why_not_fused
 from ls3_torchrl.planners.imagination import ImaginationNoise, Limits
 from ls3_torchrl.planners.latent_env import LatentEnv
-from ls3_torchrl.planners.layers import (
-    Layers,
-    Precision,
-    fastest_precision,
-    is_relu_mlp,
-    layers_of,
-    members_of,
-    run_layers,
-)
 from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction, feasible
+from ls3_torchrl.planners.snapshot import Snapshot
 
 #: Particles that are carried together: their widest layer stays in a core's cache, or fills a GPU.
 _CPU_BLOCK, _GPU_BLOCK = 4096, 262_144
@@ -40,10 +32,6 @@ Result = TypeVar("Result")
 
 def _by_member(members: Tensor) -> Groups:
     return [(m, (members == m).nonzero().flatten()) for m in members.unique().tolist()]
-
-
-def _same(one: Tensor, other: Tensor) -> bool:
-    return (one.device, one.dtype) == (other.device, other.dtype) and torch.equal(one, other)
 
 
 def _take_one_thread() -> None:
@@ -71,17 +59,18 @@ class FusedImagination:
     """The same statistics as :class:`~ls3_torchrl.planners.RolloutImagination`, many times faster.
 
     It works on a snapshot of the weights, taken anew whenever a parameter has changed since. Plans of all rows lie one
-    after another and are judged in blocks, spread over the cores: memory grows with the block, not with B x N x P.
+    after another and are imagined in blocks, spread over the cores: memory grows with the block, not with B x N x P.
     Latents stay float32; the layers run in ``precision``.
 
     Args:
-        env: the learned model; its networks must be those of :mod:`ls3_torchrl.modules`.
-        value: V.
-        safe_set: f_S.
+        env: the learned model; its modules must be those of :mod:`ls3_torchrl.modules`, or subclasses that override
+            none of the methods whose work is done here.
+        value: V, likewise.
+        safe_set: f_S, likewise.
         constraint_reduction: over particles, ``"max"`` or ``"mean"``.
         safe_set_reduction: over particles, ``"mean"`` or ``"min"``.
         precision: ``"fp32"``, ``"bf16"``, or ``"auto"`` for what a short measurement finds faster here.
-        block: particles that are carried and judged together; by default what stays in a CPU's cache, or what fills a
+        block: particles that are carried together; by default what stays in a CPU's cache, or what fills a
             GPU.
         compiled: fuse the work on a block with ``torch.compile`` and replay it as a CUDA graph; by default on CUDA
             alone. Only blocks of the size that comes first are compiled, so that the rare plans for a few rows that
@@ -89,14 +78,14 @@ class FusedImagination:
 
     Raises:
         ValueError: for an unknown precision.
-        TypeError: when a network is not a plain ReLU network.
+        TypeError: when a module would be bypassed; it says which, and why.
     """
 
     def __init__(
         self,
         env: LatentEnv,
-        value: ValueEnsemble,
-        safe_set: LatentClassifier,
+        value: TensorDictModuleBase,
+        safe_set: TensorDictModuleBase,
         *,
         constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
@@ -105,11 +94,7 @@ class FusedImagination:
         compiled: bool | None = None,
     ) -> None:
         require_choice(precision, ("auto", "fp32", "bf16"), "precision")
-        if not self.supports(env, value, safe_set):
-            raise TypeError(
-                "FusedImagination needs EnsembleDynamics, ValueEnsemble and classifiers with plain ReLU networks. "
-                'Use engine="rollout" for other modules.'
-            )
+        require_fusable(env, value, safe_set)
         self.env, self.value, self.safe_set = env, value, safe_set
         self.constraint_reduction = constraint_reduction
         self.safe_set_reduction = safe_set_reduction
@@ -117,50 +102,22 @@ class FusedImagination:
         self.block = block
         self.compiled = compiled
         self._compiled_plans: int | None = None  # plans in a block that is worth compiling
-        self._seen: list[Tensor] = []
+        self._snapshot = Snapshot(env, value, safe_set, precision)
         self._parameters_fixed = False
-        self._members: list[Layers] = []  # the dynamics, one member after another
-        self._stacked: Layers = []  # the dynamics in weights [M, in, out] and biases [M, 1, out]
-        self._value: list[Layers] = []
-        self._heads: dict[str, Layers] = {}
 
     @staticmethod
-    def supports(env: LatentEnv, value: nn.Module, safe_set: nn.Module) -> bool:
-        """Whether these modules can be run from a snapshot of their layers."""
-        ensembles = all(isinstance(getattr(m, "network", None), EnsembleMLP) for m in (env.dynamics, value))
-        heads = (env.constraint, env.goal, safe_set)
-        return ensembles and all(is_relu_mlp(getattr(head, "network", nn.Identity())) for head in heads)
+    def supports(env: nn.Module, value: nn.Module, safe_set: nn.Module) -> bool:
+        """Whether these modules can be run from a snapshot of their layers without bypassing any of their code."""
+        return why_not_fused(env, value, safe_set) is None
 
-    def _parameters(self) -> Iterable[nn.Parameter]:
-        for module in (self.env.dynamics, self.env.constraint, self.env.goal, self.value, self.safe_set):
-            yield from module.parameters()
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what was compiled, which is compiled anew where it is needed."""
+        kept = {name: value for name, value in vars(self).items() if name != "_replay"}
+        return {**kept, "_compiled_plans": None, "_parameters_fixed": False}
 
     def refresh(self) -> bool:
         """Take the snapshot anew if a parameter changed; return whether it had."""
-        # Values are compared: fused optimisers change parameters without raising their version counter.
-        parameters = list(self._parameters())
-        if len(parameters) == len(self._seen) and all(map(_same, parameters, self._seen)):
-            return False
-        device = parameters[0].device
-        chosen = fastest_precision(device.type) if self.precision == "auto" else self.precision
-        self._dtype = torch.bfloat16 if chosen == "bf16" else torch.float32
-        network = self.env.dynamics.network
-        self._members = members_of(network, self._dtype)
-        self._stacked = [
-            (weight.detach().to(self._dtype).clone(), bias.detach().to(self._dtype).clone())
-            for weight, bias in zip(network.weights, network.biases, strict=True)
-        ]
-        self._value = members_of(self.value.network, self._dtype)
-        self._heads = {
-            name: layers_of(head.network, self._dtype)
-            for name, head in (
-                ("constraint", self.env.constraint),
-                ("goal", self.env.goal),
-                ("safe_set", self.safe_set),
-            )
-        }
-        self._seen = [p.detach().clone() for p in parameters]
-        return True
+        return self._snapshot.refresh()
 
     @contextmanager
     def parameters_fixed(self) -> Iterator[None]:
@@ -184,51 +141,51 @@ class FusedImagination:
         if not self._parameters_fixed:
             self.refresh()
         b, n, horizon, _ = actions.shape
-        particles, plans = noise.members.shape[1], b * n
-        on_cpu = latent.device.type == "cpu"
+        plans, on_cpu = b * n, latent.device.type == "cpu"
         compiled = not on_cpu if self.compiled is None else self.compiled
         if compiled or not on_cpu:
             limits = None  # which plans are feasible is known there alone: asking costs more than valuing them all
         workers = torch.get_num_threads() if on_cpu else 1
-        block = self.block or (_CPU_BLOCK if on_cpu else _GPU_BLOCK)
-        share = max(-(-plans // workers), -(-_SMALLEST_PART // particles))
-        size = max(1, min(block // particles, share))
-        parts = [slice(start, min(start + size, plans)) for start in range(0, plans, size)]
+        parts = self._parts(plans, noise.members.shape[1], workers, on_cpu=on_cpu)
+        if compiled and self._compiled_plans is None:
+            self._compiled_plans = parts[0].stop
         # Rows of the batch lie one after another: a part may hold plans of several.
         row_of = torch.arange(b, device=latent.device).repeat_interleave(n)
         steps = actions.reshape(plans, horizon, -1).transpose(0, 1)
         groups = [_by_member(members) for members in noise.members] if on_cpu and not compiled else None
 
-        def judge(part: slice) -> PlanStatistics:
-            rows = row_of[part]
-            alone = bool(part.start // n == (part.stop - 1) // n)
-            first = int(part.start // n)
+        def imagine(part: slice) -> PlanStatistics:
+            rows, first = row_of[part], part.start // n
+            alone = first == (part.stop - 1) // n
             if noise.noise.shape[3] == 1:
                 drawn = noise.noise[first] if alone else noise.noise[rows, :, :, 0].permute(1, 2, 0, 3)
             else:
                 drawn = noise.noise.permute(1, 2, 0, 3, 4).flatten(2, 3)[:, :, part]
-            own = limits
-            if own is not None:
-                own = own._replace(safe_set_threshold=own.safe_set_threshold[rows])
+            own = None if limits is None else limits._replace(safe_set_threshold=limits.safe_set_threshold[rows])
             start = latent[first : first + 1] if alone else latent[rows]
             plan = steps[:, part].contiguous()
             if compiled and plan.shape[1] == self._compiled_plans:
                 torch.compiler.cudagraph_mark_step_begin()
                 # Copies, since the next replay writes over what this one returns.
                 return PlanStatistics(*(x.clone() for x in self._replay(start, plan, noise.members, None, drawn, None)))
-            return self._judge(start, plan, noise.members, groups, drawn, own)
+            return self._imagine(start, plan, noise.members, groups, drawn, own)
 
-        if compiled and self._compiled_plans is None:
-            self._compiled_plans = min(size, plans)
-        found = _side_by_side(judge, parts, 1 if compiled else workers)
+        found = _side_by_side(imagine, parts, 1 if compiled else workers)
         return PlanStatistics(*(torch.cat(pieces).unflatten(0, (b, n)) for pieces in zip(*found, strict=True)))
+
+    def _parts(self, plans: int, particles: int, workers: int, *, on_cpu: bool) -> list[slice]:
+        """Plans that are imagined together: as many as a block holds, and no fewer than are worth a core."""
+        block = self.block or (_CPU_BLOCK if on_cpu else _GPU_BLOCK)
+        fraction = max(-(-plans // workers), -(-_SMALLEST_PART // particles))
+        size = max(1, min(block // particles, fraction))
+        return [slice(start, min(start + size, plans)) for start in range(0, plans, size)]
 
     @cached_property
     def _replay(self) -> Callable[..., PlanStatistics]:
-        return torch.compile(self._judge, dynamic=False, mode="reduce-overhead")
+        return torch.compile(self._imagine, dynamic=False, mode="reduce-overhead")
 
     @torch.no_grad()
-    def _judge(
+    def _imagine(
         self,
         latent: Tensor,
         plan: Tensor,
@@ -239,14 +196,14 @@ class FusedImagination:
     ) -> PlanStatistics:
         """Statistics of the plans ``[H, R, A]`` from latents ``[R or 1, D]`` under noise ``[H, P, R or 1, D]``."""
         horizon, r, _ = plan.shape
-        particles = noise.shape[1]
+        particles, snapshot = noise.shape[1], self._snapshot
         path = self._unroll(latent, plan, members, groups, noise)
         violating = torch.stack([self._probability("constraint", states) for states in path], -1)  # [P, R, H]
         constraint = violating.amax(0) if self.constraint_reduction == "max" else violating.mean(0)
         in_safe_set = self._probability("safe_set", path[-1])
         safe = in_safe_set.amin(0) if self.safe_set_reduction == "min" else in_safe_set.mean(0)
 
-        value, goal = latent.new_full((r, len(self._value)), torch.nan), latent.new_full((r, horizon), torch.nan)
+        value, goal = latent.new_full((r, len(snapshot.value)), torch.nan), latent.new_full((r, horizon), torch.nan)
         found = PlanStatistics(value, goal, constraint, safe)
         wanted = torch.arange(r, device=latent.device)
         if limits is not None:
@@ -261,13 +218,13 @@ class FusedImagination:
         kept = path if len(wanted) == r else [states[:, wanted] for states in path]
         goal[wanted] = torch.stack([self._probability("goal", states).mean(0) for states in kept], -1)
         ends = kept[-1].reshape(-1, kept[-1].shape[-1])
-        values = [run_layers(ends, layers).float().reshape(particles, -1).mean(0) for layers in self._value]
+        values = [run_layers(ends, layers).float().reshape(particles, -1).mean(0) for layers in snapshot.value]
         value[wanted] = torch.stack(values, -1)
         return found
 
     def _probability(self, head: str, states: Tensor) -> Tensor:
         """Probabilities ``[...]`` by a head of latents ``[..., D]``."""
-        logit = run_layers(states.reshape(-1, states.shape[-1]), self._heads[head])
+        logit = run_layers(states.reshape(-1, states.shape[-1]), self._snapshot.heads[head])
         return logit.float().sigmoid().reshape(states.shape[:-1])
 
     def _unroll(
@@ -279,11 +236,12 @@ class FusedImagination:
         state = latent.expand(particles, rows, -1)
         path = []
         for t, action in enumerate(plan):
-            x = dynamics.network_input(state, action.expand(particles, -1, -1)).to(self._dtype)
+            x = dynamics.network_input(state, action.expand(particles, -1, -1)).to(self._snapshot.dtype)
             output = self._move_together(x, members[t]) if groups is None else self._move_by_member(x, groups[t])
             delta, log_scale = dynamics.read_output(output.float(), action)
+            delta, log_scale = delta.float(), log_scale.float()  # they are wider where the action's unit is
             state = torch.addcmul(state + delta, log_scale.exp(), noise[t].expand_as(delta))
-            path.append(state.to(self._dtype))
+            path.append(state.to(self._snapshot.dtype))
         return path
 
     def _move_by_member(self, x: Tensor, groups: Groups) -> Tensor:
@@ -291,7 +249,9 @@ class FusedImagination:
         output = None
         for member, which in groups:
             mine = x[which] if len(groups) > 1 else x
-            moved = run_layers(mine.reshape(-1, x.shape[-1]), self._members[member]).reshape(*mine.shape[:-1], -1)
+            moved = run_layers(mine.reshape(-1, x.shape[-1]), self._snapshot.members[member]).reshape(
+                *mine.shape[:-1], -1
+            )
             if len(groups) == 1:
                 return moved
             output = moved.new_empty(*x.shape[:-1], moved.shape[-1]) if output is None else output
@@ -301,8 +261,8 @@ class FusedImagination:
 
     def _move_together(self, x: Tensor, member: Tensor) -> Tensor:
         """The same in batched products with gathered weights: nothing here waits for the device."""
-        last = len(self._stacked) - 1
-        for i, (weight, bias) in enumerate(self._stacked):
+        last = len(self._snapshot.stacked) - 1
+        for i, (weight, bias) in enumerate(self._snapshot.stacked):
             x = torch.baddbmm(bias[member], x, weight[member])
             if i < last:
                 x = x.relu_()

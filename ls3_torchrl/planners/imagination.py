@@ -6,12 +6,12 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple, Protocol
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from ls3_torchrl.modules.classifiers import LatentClassifier
-from ls3_torchrl.modules.value import ValueEnsemble
-from ls3_torchrl.planners.latent_env import LatentEnv
+from ls3_torchrl.modules.call import call_on_latent
+from ls3_torchrl.planners.latent_env import LatentEnv, probability_of
 from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction
 
 
@@ -32,21 +32,24 @@ class PlanNoise(NamedTuple):
     """All randomness of a plan over K iterations, for plans that must be repeatable.
 
     Attributes:
-        normal: candidates' Gaussian noise ``[K, B, N, H, A]``.
-        uniform: candidates' uniform noise in [0, 1) ``[K, B, N, H, A]``.
+        candidates: the optimiser's noise, each ``[K, B, ...]``; of the cross-entropy method standard normal and
+            uniform in [0, 1), ``[K, B, N, H, A]`` each.
         members: dynamics members ``[K, H, P]``.
         dynamics: dynamics noise ``[K, B, H, P, N or 1, D]``.
     """
 
-    normal: Tensor
-    uniform: Tensor
+    candidates: tuple[Tensor, ...]
     members: Tensor
     dynamics: Tensor
 
     def row(self, index: int) -> PlanNoise:
         """The noise of one batch row, as a batch of one."""
         one = slice(index, index + 1)
-        return PlanNoise(self.normal[:, one], self.uniform[:, one], self.members, self.dynamics[:, one])
+        return PlanNoise(tuple(part[:, one] for part in self.candidates), self.members, self.dynamics[:, one])
+
+    def of_iteration(self, iteration: int, rows: Tensor) -> ImaginationNoise:
+        """What rows ``[b]`` are imagined under in one iteration."""
+        return ImaginationNoise(self.members[iteration], self.dynamics[iteration][rows])
 
 
 class Limits(NamedTuple):
@@ -76,29 +79,46 @@ class Imagination(Protocol):
         """
 
 
-def draw_members(num_members: int, horizon: int, particles: int, *, fixed: bool, device: torch.device) -> Tensor:
-    """Members ``[H, P]``: an even split in random order, drawn anew at each step, or once if ``fixed`` (TS-∞)."""
+def sample_imagination_noise(
+    env: LatentEnv, rows: int, horizon: int, particles: int, candidates: int, *, device: torch.device | None = None
+) -> ImaginationNoise:
+    """Members and noise for ``rows`` plans: an even split of the particles, anew at each step or once under TS-∞.
 
-    def one() -> Tensor:
-        order = torch.randperm(particles, device=device) % num_members
-        return torch.randperm(num_members, device=device)[order]
+    Args:
+        env: the learned model; dynamics that are no ensemble have one member.
+        rows: b.
+        horizon: H.
+        particles: P.
+        candidates: N for noise of each candidate's own; 1 for noise that a row's candidates share.
+        device: where to draw.
+    """
 
-    return one().expand(horizon, -1) if fixed else torch.stack([one() for _ in range(horizon)])
+    def members() -> Tensor:
+        if hasattr(env.dynamics, "sample_members"):
+            return env.dynamics.sample_members(particles, device=device)
+        return torch.zeros(particles, dtype=torch.long, device=device)
+
+    over_time = members().expand(horizon, -1) if env.fixed_members else torch.stack([members() for _ in range(horizon)])
+    noise = torch.randn(rows, horizon, particles, candidates, env.latent_dim, device=device)
+    return ImaginationNoise(over_time, noise)
 
 
 class RolloutImagination:
     """Imagines by ``LatentEnv.rollout``, one tensordict row per particle: plain, slow, for any modules.
 
+    Members and noise are handed to dynamics that have a ``member_key`` and a ``noise_key``; other dynamics draw what
+    they need themselves.
+
     Args:
         env: the learned model.
-        value: V.
-        safe_set: f_S.
+        value: V; a module of a latent that writes the members' values ``[*B, M, 1]``, or one value ``[*B, 1]``.
+        safe_set: f_S; a module of a latent whose first output is a logit ``[*B, 1]``.
         constraint_reduction: over particles, ``"max"`` (the authors') or ``"mean"``.
         safe_set_reduction: over particles, ``"mean"`` (the authors') or ``"min"``.
 
     Example:
         >>> from torchrl.data import Bounded
-        >>> from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet
+        >>> from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
         >>> spec = Bounded(low=-1.0, high=1.0, shape=(2,))
         >>> env = LatentEnv(EnsembleDynamics(8, 2), ConstraintEstimator(8), GoalEstimator(8), action_spec=spec)
         >>> imagine = RolloutImagination(env, ValueEnsemble(8), SafeSet(8))
@@ -110,8 +130,8 @@ class RolloutImagination:
     def __init__(
         self,
         env: LatentEnv,
-        value: ValueEnsemble,
-        safe_set: LatentClassifier,
+        value: TensorDictModuleBase,
+        safe_set: TensorDictModuleBase,
         *,
         constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
@@ -129,36 +149,44 @@ class RolloutImagination:
         self, latent: Tensor, actions: Tensor, noise: ImaginationNoise, limits: Limits | None = None
     ) -> PlanStatistics:
         """Statistics of ``actions`` ``[b, N, H, A]`` carried out from ``latent`` ``[b, D]``; all of them, always."""
+        path = self._rollout(latent, actions, noise)
+        end = path.get(unravel_key(("next", self.env.latent_key)))[..., -1, :]
+        value = call_on_latent(self.value, end)
+        value = value if value.ndim == end.ndim else value.squeeze(-1)  # one value is one member
+        constraint, goal = (
+            path.get(unravel_key(("next", key))).squeeze(-1)
+            for key in (self.env.constraint_prob_key, self.env.goal_prob_key)
+        )
+        safe = probability_of(self.safe_set, end).squeeze(-1)
+        return PlanStatistics(
+            value=value.mean(2).float(),
+            goal_prob=goal.mean(2).float(),
+            constraint_prob=(constraint.amax(2) if self.constraint_reduction == "max" else constraint.mean(2)).float(),
+            safe_set_prob=(safe.amin(2) if self.safe_set_reduction == "min" else safe.mean(2)).float(),
+        )
+
+    def _rollout(self, latent: Tensor, actions: Tensor, noise: ImaginationNoise) -> TensorDictBase:
+        """P particles of every plan, ``[b, N, P, H]``."""
         b, n, horizon, _ = actions.shape
         p, d = noise.members.shape[1], latent.shape[-1]
-        dynamics = self.env.dynamics
-        action_key, clock = dynamics.in_keys[1], iter(range(horizon))
+        env, dtype = self.env, self.env.latent_dtype
+        member_key, noise_key = (getattr(env.dynamics, name, None) for name in ("member_key", "noise_key"))
+        clock = iter(range(horizon))
+
+        def members_at(t: int) -> Tensor:
+            return noise.members[t].reshape(1, 1, p, 1).expand(b, n, p, 1)
 
         def follow_the_plan(tensordict: TensorDictBase) -> TensorDictBase:
             t = next(clock)
-            members = noise.members[t].reshape(1, 1, p, 1).expand(b, n, p, 1)
-            step_noise = noise.noise[:, t].transpose(1, 2).expand(b, n, p, d)
-            tensordict.set(action_key, actions[:, :, t].unsqueeze(2).expand(b, n, p, -1))
-            return tensordict.set(dynamics.member_key, members).set(dynamics.noise_key, step_noise)
+            if member_key is not None:
+                tensordict.set(member_key, members_at(t))
+            if noise_key is not None:
+                tensordict.set(noise_key, noise.noise[:, t].transpose(1, 2).expand(b, n, p, d).to(dtype))
+            return tensordict.set(env.action_key, actions[:, :, t].unsqueeze(2).expand(b, n, p, -1))
 
-        first = TensorDict({"latent": latent[:, None, None].expand(b, n, p, d)}, [b, n, p])
-        if dynamics.propagation == "tsinf":
-            first.set(dynamics.member_key, noise.members[0].reshape(1, 1, p, 1).expand(b, n, p, 1))
-        path = self.env.rollout(
-            horizon,
-            follow_the_plan,
-            auto_reset=False,
-            tensordict=self.env.reset(first),
-            return_contiguous=True,
-        )
-        end = path["next", "latent"][..., -1, :]
-        ends = TensorDict({self.value.in_keys[0]: end}, [b, n, p])
-        value = self.value(ends).get(self.value.out_keys[0]).squeeze(-1)
-        constraint = path["next", "constraint_prob"].squeeze(-1)
-        safe = self.safe_set.probability(end).squeeze(-1)
-        return PlanStatistics(
-            value=value.mean(2),
-            goal_prob=path["next", "goal_prob"].squeeze(-1).mean(2),
-            constraint_prob=constraint.amax(2) if self.constraint_reduction == "max" else constraint.mean(2),
-            safe_set_prob=safe.amin(2) if self.safe_set_reduction == "min" else safe.mean(2),
-        )
+        first = TensorDict({}, [b, n, p])
+        first.set(env.latent_key, latent[:, None, None].expand(b, n, p, d).to(dtype))
+        if env.fixed_members:
+            first.set(member_key, members_at(0))
+        start = env.reset(first)
+        return env.rollout(horizon, follow_the_plan, auto_reset=False, tensordict=start, return_contiguous=True)

@@ -2,33 +2,47 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import ModelBasedEnvBase
 
-from ls3_torchrl._checks import require_keys
+from ls3_torchrl._checks import require_at_least
+from ls3_torchrl.modules.call import call_on_latent
 from ls3_torchrl.modules.classifiers import LatentClassifier
-from ls3_torchrl.modules.dynamics import EnsembleDynamics
 
 
 class LatentEnv(ModelBasedEnvBase):
-    """Imagination as an environment: f_dyn moves the latent, f_C and f_G judge where it arrives.
+    """Imagination as an environment: f_dyn moves the latent, f_C and f_G say where it arrives.
 
     Every row is one particle. The reward is the task's own, −1 outside the goal set and 0 in it, with
     "in the goal set" meaning that f_G's probability exceeds one half. It never ends an episode.
 
+    ``reset`` starts from the latents of the tensordict that it is given, and draws them from the VAE's prior N(0, 1)
+    where there are none: for a tensordict without entries, as many as its batch size says; for ``reset()``, one.
+
+    Latents and actions are found under the dynamics' own keys. Any module will do as dynamics that reads a latent and
+    an action and writes the next latent; as classifiers, any modules of a latent whose first output is a logit.
+
     Args:
-        dynamics: f_dyn.
-        constraint: f_C.
-        goal: f_G.
-        action_spec: bounds of one action, shape ``[A]``.
-        device: where to imagine; the modules are moved there.
+        dynamics: f_dyn; ``in_keys`` are the latent ``[*B, D]`` and the action ``[*B, A]``, the first of its
+            ``out_keys`` is the next latent ``[*B, D]``.
+        constraint: f_C, logit ``[*B, 1]``.
+        goal: f_G, logit ``[*B, 1]``.
+        action_spec: bounds of one action, shape ``[A]``, of any floating dtype.
+        latent_dim: D; the dynamics' ``latent_dim`` when ``None``, which a module from elsewhere may not have.
+        constraint_prob_key: where f_C's probability ``[*B, 1]`` is written.
+        goal_prob_key: where f_G's probability ``[*B, 1]`` is written.
+        reward_key: where the reward ``[*B, 1]`` is written.
+        device: where to imagine; the modules are moved there. Where the dynamics are when ``None``.
 
     Raises:
-        ValueError: when the action spec is unbounded or its size is not the dynamics'.
-        KeyError: by ``reset``, without a latent to start from.
+        ValueError: when the action spec is unbounded, not floating or not of the dynamics' size; when nobody says what
+            D is; by ``reset``, for a tensordict with entries but without a latent to start from.
 
     Example:
         >>> from tensordict import TensorDict
@@ -38,71 +52,149 @@ class LatentEnv(ModelBasedEnvBase):
         >>> start = env.reset(TensorDict({"latent": torch.zeros(6, 8)}, [6]))
         >>> env.rollout(5, auto_reset=False, tensordict=start)["next", "constraint_prob"].shape
         torch.Size([6, 5, 1])
+        >>> env.rollout(5)["latent"].shape  # from one draw of the prior
+        torch.Size([5, 8])
     """
 
     def __init__(
         self,
-        dynamics: EnsembleDynamics,
-        constraint: LatentClassifier,
-        goal: LatentClassifier,
+        dynamics: TensorDictModuleBase,
+        constraint: TensorDictModuleBase,
+        goal: TensorDictModuleBase,
         *,
         action_spec: TensorSpec,
-        device: torch.device | str = "cpu",
+        latent_dim: int | None = None,
+        constraint_prob_key: NestedKey = "constraint_prob",
+        goal_prob_key: NestedKey = "goal_prob",
+        reward_key: NestedKey = "reward",
+        device: torch.device | str | None = None,
     ) -> None:
-        if not isinstance(action_spec, Bounded):
-            raise ValueError(f"Planning needs a bounded action spec, got {type(action_spec).__name__}.")
-        if tuple(action_spec.shape) != (dynamics.action_dim,):
-            raise ValueError(
-                f"The action spec must have shape [{dynamics.action_dim}] as the dynamics' actions, got "
-                f"{list(action_spec.shape)}. Take one row of a batched environment's spec: env.action_spec[0]."
-            )
-        dynamics_step = [dynamics, TensorDictModule(_identity, [dynamics.out_keys[0]], ["latent"])]
-        judges = [
-            TensorDictModule(constraint.probability, ["latent"], ["constraint_prob"]),
-            TensorDictModule(goal.probability, ["latent"], ["goal_prob"]),
-        ]
-        reward = TensorDictModule(_reward_of_goal, ["goal_prob"], ["reward"])
-        super().__init__(
-            TensorDictSequential(*dynamics_step, *judges, reward),
-            device=torch.device(device),
-            batch_size=None,
-        )
-        # TensorDictModule does not register bound methods' owners: hold the networks here.
+        latent_dim = getattr(dynamics, "latent_dim", None) if latent_dim is None else latent_dim
+        if latent_dim is None:
+            raise ValueError(f"{type(dynamics).__name__} does not say how large its latents are: give latent_dim.")
+        require_at_least(latent_dim, 1, "latent_dim")
+        _check_action_spec(action_spec, getattr(dynamics, "action_dim", None))
+        if device is None:
+            device = next(chain(dynamics.parameters(), dynamics.buffers(), [action_spec.space.low])).device
+        super().__init__(dynamics, device=torch.device(device), batch_size=None)
         self.dynamics, self.constraint, self.goal = (m.to(self.device) for m in (dynamics, constraint, goal))
-        self._judges = TensorDictSequential(*judges)
-        latent = Unbounded(shape=(dynamics.latent_dim,), device=self.device)
-        probability = Bounded(low=0.0, high=1.0, shape=(1,), device=self.device)
-        self.observation_spec = Composite(
-            latent=latent, constraint_prob=probability, goal_prob=probability.clone(), device=self.device
-        )
-        if dynamics.propagation == "tsinf":
-            member = Unbounded(shape=(1,), dtype=torch.int64, device=self.device)
-            self.observation_spec[dynamics.member_key] = member
-        self.state_spec = Composite(latent=latent.clone(), device=self.device)
-        self.action_spec = action_spec.to(self.device)
-        self.reward_spec = Bounded(low=-1.0, high=0.0, shape=(1,), device=self.device)
+        self.latent_dim = latent_dim
+        self.latent_key = unravel_key(dynamics.in_keys[0])
+        self.constraint_prob_key, self.goal_prob_key = unravel_key(constraint_prob_key), unravel_key(goal_prob_key)
+        self._set_specs(action_spec, unravel_key(reward_key))
+
+    def _set_specs(self, action_spec: TensorSpec, reward_key: NestedKey) -> None:
+        options = {"device": self.device, "dtype": self.latent_dtype}
+        latent = Unbounded(shape=(self.latent_dim,), **options)
+        probability = Bounded(low=0.0, high=1.0, shape=(1,), **options)
+        observed = {
+            self.latent_key: latent,
+            self.constraint_prob_key: probability,
+            self.goal_prob_key: probability.clone(),
+        }
+        if self.fixed_members:
+            observed[self.dynamics.member_key] = Unbounded(shape=(1,), dtype=torch.int64, device=self.device)
+        self.observation_spec = self._nested(observed)
+        self.state_spec = self._nested({self.latent_key: latent.clone()})
+        self.action_spec = self._nested({unravel_key(self.dynamics.in_keys[1]): action_spec.to(self.device)})
+        self.reward_spec = self._nested({reward_key: Bounded(low=-1.0, high=0.0, shape=(1,), **options)})
+
+    def _nested(self, specs: dict[NestedKey, TensorSpec]) -> Composite:
+        composite = Composite(device=self.device)
+        for key, spec in specs.items():
+            composite[key] = spec
+        return composite
+
+    @property
+    def latent_dtype(self) -> torch.dtype:
+        """What the dynamics compute in; float32 for dynamics without parameters."""
+        parameters = (p.dtype for p in self.dynamics.parameters() if p.is_floating_point())
+        return next(parameters, torch.float32)
+
+    @property
+    def fixed_members(self) -> bool:
+        """Whether a particle keeps the member that it drew first (TS-∞)."""
+        return getattr(self.dynamics, "propagation", "ts1") == "tsinf"
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         if tensordict is None:
-            raise KeyError("LatentEnv.reset needs a tensordict with the latent to start from: reset(td).")
-        require_keys(tensordict, ["latent"], "LatentEnv.reset")
-        out = self._judges(tensordict.select("latent"))
-        if self.dynamics.propagation == "tsinf":
+            tensordict = TensorDict({}, self.batch_size, device=self.device)
+        latent = tensordict.get(self.latent_key, None)
+        if latent is None:
+            self._require_nothing_else(tensordict)
+        if (
+            latent is None or tensordict.get("_reset", None) is not None
+        ):  # rows that need not begin anew stay as they are
+            shape = (*tensordict.batch_size, self.latent_dim)
+            latent = torch.randn(shape, device=self.device, dtype=self.latent_dtype)
+        out = self._observe(latent.to(self.latent_dtype), tensordict.batch_size)
+        if self.fixed_members:
             key = self.dynamics.member_key
             members = tensordict.get(key, None)
             if members is None:
                 rows = out.batch_size.numel()
-                members = self.dynamics.draw_members(rows, device=self.device).reshape(*out.batch_size, 1)
+                members = self.dynamics.sample_members(rows, device=self.device).reshape(*out.batch_size, 1)
             out.set(key, members)
         return out
+
+    def _require_nothing_else(self, tensordict: TensorDictBase) -> None:
+        known = {unravel_key(key) for key in (*self.reset_keys, *self.done_keys)}
+        others = [key for key in tensordict.keys(True, True) if unravel_key(key) not in known]
+        if others:
+            raise ValueError(
+                f"LatentEnv.reset found {', '.join(map(str, others))}, but no latent to start from under "
+                f"{self.latent_key!r}, the dynamics' own key. Put it there, or pass nothing to start from a draw of "
+                "N(0, 1)."
+            )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """One imagined step of every row."""
+        given = tensordict.clone(recurse=False)
+        latent, action = given.get(self.latent_key), given.get(self.action_key)
+        given.set(self.action_key, action.to(latent.dtype))
+        moved = self.world_model(given)
+        out = self._observe(moved.get(self.dynamics.out_keys[0]), tensordict.batch_size)
+        goal_prob = out.get(self.goal_prob_key)
+        out.set(self.reward_key, (goal_prob > 0.5).to(goal_prob) - 1.0)
+        if self.fixed_members:
+            out.set(self.dynamics.member_key, moved.get(self.dynamics.member_key))
+        return out
+
+    def _observe(self, latent: Tensor, batch_size: torch.Size) -> TensorDict:
+        """The latent and what the classifiers say of it."""
+        out = TensorDict({}, batch_size, device=self.device)
+        out.set(self.latent_key, latent)
+        out.set(self.constraint_prob_key, probability_of(self.constraint, latent))
+        return out.set(self.goal_prob_key, probability_of(self.goal, latent))
 
     def _set_seed(self, seed: int | None) -> None:
         """Imagination draws from torch's global generator."""
 
 
-def _identity(value: torch.Tensor) -> torch.Tensor:
-    return value
+def probability_of(classifier: nn.Module, latent: Tensor) -> Tensor:
+    """Probabilities ``[*B, 1]`` of latents ``[*B, D]``, as the classifier itself would give them.
+
+    By its ``forward``, whose first output is a logit; by its ``probability`` where a subclass of
+    :class:`~ls3_torchrl.modules.LatentClassifier` has redefined it.
+    """
+    if isinstance(classifier, LatentClassifier) and redefines(classifier, LatentClassifier, "probability"):
+        return classifier.probability(latent)
+    return call_on_latent(classifier, latent).sigmoid()
 
 
-def _reward_of_goal(goal_prob: torch.Tensor) -> torch.Tensor:
-    return (goal_prob > 0.5).to(goal_prob) - 1.0
+def redefines(module: object, base: type, method: str) -> bool:
+    """Whether a method of ``base`` means something else on ``module``: overridden by its class or set on itself."""
+    return method in vars(module) or getattr(type(module), method) is not getattr(base, method)
+
+
+def _check_action_spec(spec: TensorSpec, action_dim: int | None) -> None:
+    if not isinstance(spec, Bounded):
+        raise ValueError(f"Planning needs a bounded action spec, got {type(spec).__name__}.")
+    if not spec.dtype.is_floating_point:
+        raise ValueError(f"Planning needs an action spec of a floating dtype, got {spec.dtype}.")
+    if len(spec.shape) != 1 or action_dim not in (None, spec.shape[-1]):
+        expected = "A" if action_dim is None else action_dim
+        raise ValueError(
+            f"The action spec must have shape [{expected}] as the dynamics' actions, got "
+            f"{list(spec.shape)}. Take one row of a batched environment's spec: env.action_spec[0]."
+        )

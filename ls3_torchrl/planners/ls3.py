@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import warnings
+from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import InteractionType, TensorDictModuleBase, set_interaction_type
 from torch import Tensor
 from torchrl.envs import TensorDictPrimer
@@ -18,20 +19,20 @@ from ls3_torchrl._checks import (
     require_keys,
     require_probability,
 )
-from ls3_torchrl.modules.classifiers import LatentClassifier
-from ls3_torchrl.modules.value import ValueEnsemble
-from ls3_torchrl.planners.cem import CEMResult, CrossEntropyMethod, PlanScores
-from ls3_torchrl.planners.fused import FusedImagination
+from ls3_torchrl.layers import Precision
+from ls3_torchrl.modules.call import posterior_keys
+from ls3_torchrl.planners.cem import optimizer_or_default
+from ls3_torchrl.planners.decisions import Decisions
+from ls3_torchrl.planners.engine import Engine, EngineName
 from ls3_torchrl.planners.imagination import (
     Imagination,
     ImaginationNoise,
     Limits,
     PlanNoise,
-    RolloutImagination,
-    draw_members,
+    sample_imagination_noise,
 )
 from ls3_torchrl.planners.latent_env import LatentEnv
-from ls3_torchrl.planners.layers import Precision
+from ls3_torchrl.planners.optimizer import Optimizer, OptimizerResult, PlanScores
 from ls3_torchrl.planners.scoring import (
     ConstraintReduction,
     GoalReduction,
@@ -43,8 +44,6 @@ from ls3_torchrl.planners.scoring import (
 )
 from ls3_torchrl.planners.warm_start import WarmStart
 
-Engine = Literal["auto", "fused", "rollout"]
-
 
 class LS3Planner(MPCPlannerBase):
     """Model predictive control inside the safe set (section 1.1.1, "Cross Entropy Method").
@@ -54,55 +53,59 @@ class LS3Planner(MPCPlannerBase):
     starts again. When the relaxations are used up, it acts on the plan with the fewest predicted violations
     and the safest end, never at random, and says so under ``("plan", "fallback")``.
 
-    Plans for all rows of a batch at once, each with its own δ_S, warm start and reset. Use it as the policy
-    of any collector or ``rollout``; with ``p_random`` below 1 append :meth:`primer` and an ``InitTracker`` to
-    the environment, so that the last plan is carried to the next step and dropped at a reset.
+    Plans for all rows of a batch at once, each with its own δ_S, warm start and reset. Use it as the policy of any
+    collector or ``rollout``. An optimiser that starts from the last plan (``p_random`` below 1) needs that plan carried
+    from step to step and dropped at a reset: ``Collector(auto_register_policy_transforms=True)`` does so by itself;
+    elsewhere append :meth:`make_tensordict_primer` and an ``InitTracker`` to the environment.
+
+    It computes in float32, whatever the dtype of the latents; the action has the dtype of its spec.
 
     Args:
-        env: the learned model.
-        value: V.
-        safe_set: f_S.
-        encoder: module from observations to ``latent``; the mean of a posterior is used. ``None`` when the
-            tensordict holds the latent already.
+        model: the learned model.
+        value: V; any module of a latent that writes the members' values ``[*B, M, 1]``, or one value ``[*B, 1]``.
+        safe_set: f_S; any module of a latent whose first output is a logit ``[*B, 1]``.
+        encoder: any module from observations to a latent: it writes ``latent_key``, of which it is asked for the mean,
+            or else ``loc``, ``latent`` or a single key. ``None`` when the tensordict holds the latent already.
+        optimizer: searches for the best feasible plan; a :class:`~ls3_torchrl.planners.CrossEntropyMethod` when
+            ``None``.
         horizon: H, imagined steps.
-        num_candidates: N.
-        num_elites: sequences that the Gaussian is refitted on, 1 to N.
         num_particles: P, imagined outcomes of each plan.
-        optim_steps: scored rounds. Table 1's n_cem_iters = 5 samples five iterations and scores four.
         safe_set_threshold: initial δ_S, a probability strictly between 0 and 1.
         constraint_threshold: δ_C, likewise.
         relaxation: factor on δ_S when nothing is feasible, strictly between 0 and 1.
         max_relaxations: how often δ_S may be relaxed in one plan.
-        p_random: share of uniform candidates in the first round; the rest are drawn round the last plan.
-        p_constant: share of candidates in the first round that hold one uniform action over the horizon.
         constraint_reduction: over particles, ``"max"`` as the authors' code or ``"mean"``.
         safe_set_reduction: over particles, ``"mean"`` as the authors' code or ``"min"``: every particle must end
-            in the safe set. A mean of δ_S lets a share 1 − δ_S of the particles end anywhere, and a plan gains from
+            in the safe set. A mean of δ_S lets a fraction 1 − δ_S of the particles end anywhere, and a plan gains from
             sending them where the value is overestimated.
         goal_reduction: over imagined steps, ``"count"`` of those that are more likely in the goal than not, as the
             authors' code, or ``"expected"``, the sum of the probabilities.
         pessimism: κ ≥ 0, subtracts κ standard deviations over the value ensemble; 0 is the paper.
-        common_noise: judge all candidates of a row by the same particles (common random numbers), which
+        common_noise: score all candidates of a row by the same particles (common random numbers), which
             compares them with less variance; ``False`` draws noise for each.
         noise_scale: factor on the dynamics' learnt standard deviation, at least 0; 1 is the paper. With 0 the
             particles differ by their members alone. Where latents are samples of wide posteriors, most of that
             deviation is the posteriors' own, and with few particles it drowns what tells one plan from another.
-        min_std: floor of the refitted standard deviation, a share of the action box's side.
-        engine: ``"fused"`` runs a snapshot of the networks, ``"rollout"`` runs ``LatentEnv.rollout`` and takes
-            any modules, ``"auto"`` the first where it can.
+        engine: ``"fused"`` runs a snapshot of the networks; ``"rollout"`` runs ``LatentEnv.rollout`` and takes
+            any modules; ``"auto"`` the first wherever it bypasses no module, which is looked at before each plan.
         precision: of the fused engine.
         action_key: where the action ``[*B, A]`` is written.
-        latent_key: where the encoder writes the latent.
+        latent_key: where the latent is read, or where the encoder writes it.
         plan_key: group under which the plan is described.
         is_init_key: bool ``[*B, 1]``, the first step of an episode; optional.
+        optimizer_settings: of the default optimiser, such as ``num_candidates=200``; see ``CrossEntropyMethod``.
 
     Returns:
-        From the call: the tensordict with ``action``, and under ``plan`` ``feasible``, ``fallback``,
+        From the call: the tensordict with ``action``, and under ``plan`` ``feasible``, ``fallback``, ``relaxed``,
         ``safe_set_threshold`` (the δ_S acted on), ``score``, ``iterations``, all ``[*B, 1]``; under
-        ``("next", "plan")`` the warm start ``mean`` and ``std`` ``[*B, H, A]``.
+        ``("next", "plan")`` the warm start ``mean`` and ``std`` ``[*B, H, A]``. ``out_keys`` name all of these.
+        ``in_keys`` name what is read: the observation, and if the optimiser uses it, the warm start and ``is_init``.
+        A tensordict may lack those two, but a ``TensorDictSequential`` that is ``partial_tolerant`` leaves the planner
+        out then, as it does every module that lacks an input.
 
     Raises:
         ValueError: for settings out of range; by the call, for an observation that is not finite.
+        TypeError: for unknown settings, an optimiser that is none, or modules that ``engine="fused"`` would bypass.
         KeyError: by the call, when the encoder's input is missing.
 
     Example:
@@ -111,127 +114,124 @@ class LS3Planner(MPCPlannerBase):
         >>> from torchrl.data import Bounded
         >>> from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet
         >>> from ls3_torchrl.modules import ValueEnsemble
+        >>> from ls3_torchrl.planners import CrossEntropyMethod
         >>> spec = Bounded(low=-1.0, high=1.0, shape=(2,))
-        >>> env = LatentEnv(EnsembleDynamics(8, 2), ConstraintEstimator(8), GoalEstimator(8), action_spec=spec)
-        >>> planner = LS3Planner(env, ValueEnsemble(8), SafeSet(8), num_candidates=50, num_elites=5)
+        >>> model = LatentEnv(EnsembleDynamics(8, 2), ConstraintEstimator(8), GoalEstimator(8), action_spec=spec)
+        >>> cem = CrossEntropyMethod(num_candidates=50, num_elites=5)
+        >>> planner = LS3Planner(model, ValueEnsemble(8), SafeSet(8), optimizer=cem)
         >>> planner(TensorDict({"latent": torch.zeros(3, 8)}, [3]))["action"].shape
         torch.Size([3, 2])
     """
 
     def __init__(
         self,
-        env: LatentEnv,
-        value: ValueEnsemble,
-        safe_set: LatentClassifier,
+        model: LatentEnv,
+        value: TensorDictModuleBase,
+        safe_set: TensorDictModuleBase,
         encoder: TensorDictModuleBase | None = None,
+        optimizer: Optimizer | None = None,
         *,
         horizon: int = 5,
-        num_candidates: int = 1000,
-        num_elites: int = 100,
         num_particles: int = 20,
-        optim_steps: int = 4,
         safe_set_threshold: float = 0.8,
         constraint_threshold: float = 0.2,
         relaxation: float = 0.8,
         max_relaxations: int = 5,
-        p_random: float = 1.0,
-        p_constant: float = 0.0,
         constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
         goal_reduction: GoalReduction = "count",
         pessimism: float = 0.0,
         common_noise: bool = True,
         noise_scale: float = 1.0,
-        min_std: float = 0.0,
-        engine: Engine = "auto",
+        engine: EngineName = "auto",
         precision: Precision = "auto",
         action_key: NestedKey = "action",
         latent_key: NestedKey = "latent",
         plan_key: NestedKey = "plan",
         is_init_key: NestedKey = "is_init",
+        **optimizer_settings: Any,
     ) -> None:
-        super().__init__(env, action_key=action_key)
+        super().__init__(model, action_key=action_key)
+        self.action_spec = model.full_action_spec[model.action_key]  # also where the model has it under another name
+        self.optimizer = optimizer_or_default(optimizer, optimizer_settings, owner=type(self))
         self.horizon = require_at_least(horizon, 1, "horizon")
         self.num_particles = require_at_least(num_particles, 1, "num_particles")
         self.safe_set_threshold = require_probability(safe_set_threshold, "safe_set_threshold")
         self.constraint_threshold = require_probability(constraint_threshold, "constraint_threshold")
         self.relaxation = require_probability(relaxation, "relaxation")
-        require_choice(constraint_reduction, ("max", "mean"), "constraint_reduction")
-        require_choice(safe_set_reduction, ("mean", "min"), "safe_set_reduction")
-        reductions: dict[str, Any] = {
-            "constraint_reduction": constraint_reduction,
-            "safe_set_reduction": safe_set_reduction,
-        }
-        require_choice(engine, ("auto", "fused", "rollout"), "engine")
-        if pessimism < 0.0:
-            raise ValueError(f"pessimism must not be negative, got {pessimism}.")
-        if noise_scale < 0.0:
-            raise ValueError(f"noise_scale must not be negative, got {noise_scale}.")
+        self.max_relaxations = require_at_least(max_relaxations, 0, "max_relaxations")
         require_choice(goal_reduction, ("count", "expected"), "goal_reduction")
         self.goal_reduction: GoalReduction = goal_reduction
-        self.pessimism = pessimism
-        self.noise_scale = noise_scale
+        self.pessimism = _not_negative(pessimism, "pessimism")
+        self.noise_scale = _not_negative(noise_scale, "noise_scale")
         self.common_noise = common_noise
-        self.cem = CrossEntropyMethod(
-            num_candidates=num_candidates,
-            num_elites=num_elites,
-            optim_steps=optim_steps,
-            max_restarts=max_relaxations,
-            p_random=p_random,
-            p_constant=p_constant,
-            min_std=min_std,
-        )
         self.value, self.safe_set, self.encoder = value, safe_set, encoder
-        self.imagine: Imagination
-        if engine == "fused" or (engine == "auto" and FusedImagination.supports(env, value, safe_set)):
-            self.imagine = FusedImagination(env, value, safe_set, precision=precision, **reductions)
-        else:
-            self.imagine = RolloutImagination(env, value, safe_set, **reductions)
-        self.action_key, self.latent_key = action_key, latent_key
-        self.plan_key = plan_key
+        self.engine = Engine(
+            model,
+            value,
+            safe_set,
+            engine,
+            precision=precision,
+            constraint_reduction=constraint_reduction,
+            safe_set_reduction=safe_set_reduction,
+        )
+
+        self.action_key = unravel_key(action_key)
+        self.latent_key = _latent_key(encoder, latent_key)
         space = self.action_spec.space
+        self.decisions = Decisions(plan_key)
         self.warm_start = WarmStart(space.low, space.high, horizon, plan_key, is_init_key)
-        self.in_keys = [latent_key] if encoder is None else list(encoder.in_keys)
-        self.out_keys = [action_key, *(self._plan(name) for name in _DECISIONS)]
+        self._warned = False
+        self._observation_keys = [self.latent_key] if encoder is None else list(encoder.in_keys)
+        warm_keys = self.warm_start.in_keys if self.optimizer.uses_warm_start else []
+        self.in_keys = [*self._observation_keys, *warm_keys]
+        self.out_keys = [self.action_key, *self.decisions.keys.values(), *self.warm_start.out_keys]
 
-    def _plan(self, name: str) -> NestedKey:
-        return unravel_key((self.plan_key, name))
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """The transform that carries the warm start from step to step and resets it with the episode.
 
-    def primer(self) -> TensorDictPrimer:
-        """The transform that carries the warm start from step to step and resets it with the episode."""
-        return self.warm_start.primer()
+        TorchRL finds it by itself: ``get_primers_from_module(planner)``, ``get_env_transforms_from_module(planner)``,
+        ``Collector(env, planner, auto_register_policy_transforms=True)``.
+        """
+        return self.warm_start.make_tensordict_primer()
 
-    def draw_noise(self, batch: int) -> PlanNoise:
+    def register_collector(self, collector: object) -> None:
+        """Nothing: a plan depends on no collector, and a reference to one would keep the planner from being pickled."""
+
+    @property
+    def imagine(self) -> Imagination:
+        """What imagines plans now: modules may have been exchanged, or hooked, since the last plan."""
+        return self.engine.choose()
+
+    def sample_noise(self, batch: int) -> PlanNoise:
         """All noise that a plan for ``batch`` rows can need; large, meant for tests and comparisons."""
-        device, rows = self.action_spec.device, torch.arange(batch, device=self.action_spec.device)
-        draws = [
-            (*self._draw_candidates(rows, k), *self._draw_imagination(rows, k)) for k in range(self.cem.max_iterations)
-        ]
-        return PlanNoise(*(torch.stack(parts).to(device) for parts in zip(*draws, strict=True)))
+        rows = torch.arange(batch, device=self.action_spec.device)
+        candidates, imagined = [], []
+        for _ in range(self.optimizer.max_iterations(self.max_relaxations)):
+            candidates.append(self.optimizer.sample_noise(rows, self.horizon, self.action_spec.shape[-1]))
+            imagined.append(self._sample_imagination_noise(batch, self.optimizer.num_candidates))
+        members, dynamics = (torch.stack(parts) for parts in zip(*imagined, strict=True))
+        return PlanNoise(tuple(torch.stack(parts) for parts in zip(*candidates, strict=True)), members, dynamics)
 
-    def _draw_candidates(self, rows: Tensor, iteration: int) -> tuple[Tensor, Tensor]:
-        return self.cem.draw(rows, self.horizon, self.action_spec.shape[-1])
-
-    def _draw_imagination(self, rows: Tensor, iteration: int) -> ImaginationNoise:
-        dynamics = self.env.dynamics
-        fixed = dynamics.propagation == "tsinf"
-        candidates = 1 if self.common_noise else self.cem.num_candidates
-        shape = (rows.numel(), self.horizon, self.num_particles, candidates, dynamics.latent_dim)
-        members = draw_members(dynamics.num_members, self.horizon, self.num_particles, fixed=fixed, device=rows.device)
-        return ImaginationNoise(members, self.noise_scale * torch.randn(shape, device=rows.device))
+    def _sample_imagination_noise(self, rows: int, candidates: int) -> ImaginationNoise:
+        sizes = (rows, self.horizon, self.num_particles, 1 if self.common_noise else candidates)
+        sampled = sample_imagination_noise(self.env, *sizes, device=self.action_spec.device)
+        return sampled._replace(noise=self.noise_scale * sampled.noise)
 
     def encode(self, tensordict: TensorDictBase) -> Tensor:
-        """The latent ``[*B, D]`` to plan from."""
-        require_keys(tensordict, self.in_keys, "LS3Planner")
+        """The latent ``[*B, D]`` to plan from, float32."""
+        require_keys(tensordict, self._observation_keys, "LS3Planner")
+        if not tensordict.batch_size.numel():  # not every encoder can do with no rows at all
+            return torch.zeros(*tensordict.batch_size, self.env.latent_dim, device=self.action_spec.device)
         if self.encoder is None:
             latent = tensordict.get(self.latent_key)
         else:
-            for key in self.in_keys:
+            for key in self._observation_keys:
                 require_finite(tensordict.get(key), f"The observation {key!r}")
             with set_interaction_type(InteractionType.DETERMINISTIC):
-                latent = self.encoder(tensordict.select(*self.in_keys)).get(self.latent_key)
+                latent = self.encoder(tensordict.select(*self._observation_keys)).get(self.latent_key)
         require_finite(latent, "The latent to plan from")
-        return latent
+        return latent.float()
 
     def score_plans(self, statistics: PlanStatistics, threshold: Tensor) -> PlanScores:
         """Objective, feasibility and fallback ranking of candidates under δ_S ``[b, 1]``."""
@@ -241,6 +241,7 @@ class LS3Planner(MPCPlannerBase):
             least_harm(statistics, constraint_threshold=self.constraint_threshold),
         )
 
+    @torch.compiler.disable  # a search with data-dependent ends, over threads of its own: nothing to trace
     @torch.no_grad()
     def plan(
         self,
@@ -248,7 +249,7 @@ class LS3Planner(MPCPlannerBase):
         mean: Tensor | None = None,
         std: Tensor | None = None,
         noise: PlanNoise | None = None,
-    ) -> CEMResult:
+    ) -> OptimizerResult:
         """Plan from latents, the tensors' way.
 
         Args:
@@ -257,32 +258,32 @@ class LS3Planner(MPCPlannerBase):
             std: its standard deviation.
             noise: all randomness; drawn when ``None``.
         """
-        space = self.action_spec.space
+        latent, imagine, space = latent.float(), self.imagine, self.action_spec.space
 
         def score(actions: Tensor, rows: Tensor, restarts: Tensor, iteration: int) -> PlanScores:
             if noise is None:
-                drawn = self._draw_imagination(rows, iteration)
+                sampled = self._sample_imagination_noise(len(rows), self.optimizer.num_candidates)
             else:
-                drawn = ImaginationNoise(noise.members[iteration], noise.dynamics[iteration][rows])
+                sampled = noise.of_iteration(iteration, rows)
             threshold = self._threshold(restarts).unsqueeze(-1)
             limits = Limits(threshold, self.constraint_threshold)
-            return self.score_plans(self.imagine(latent[rows], actions, drawn, limits), threshold)
+            return self.score_plans(imagine(latent[rows], actions, sampled, limits), threshold)
 
-        def candidates(rows: Tensor, iteration: int) -> tuple[Tensor, Tensor]:
-            if noise is None:
-                return self._draw_candidates(rows, iteration)
-            return noise.normal[iteration][rows], noise.uniform[iteration][rows]
+        def given(rows: Tensor, iteration: int) -> tuple[Tensor, ...]:
+            assert noise is not None
+            return tuple(part[iteration][rows] for part in noise.candidates)
 
-        with self.imagine.parameters_fixed():
-            return self.cem(
+        with imagine.parameters_fixed():
+            return self.optimizer(
                 score,
-                space.low,
-                space.high,
+                space.low.float(),
+                space.high.float(),
                 batch=latent.shape[0],
                 horizon=self.horizon,
+                max_restarts=self.max_relaxations,
                 mean=mean,
                 std=std,
-                noise=candidates,
+                noise=None if noise is None else given,
             )
 
     def _threshold(self, restarts: Tensor) -> Tensor:
@@ -304,49 +305,50 @@ class LS3Planner(MPCPlannerBase):
         latent = self.encode(tensordict)
         batch = latent.shape[:-1]
         rows = batch.numel()
-        mean, std = self.warm_start.read(tensordict, rows)
-        result = self.plan(latent.reshape(rows, -1), mean, std, noise)
-
-        decisions = {
-            "feasible": ~result.fallback,
-            "fallback": result.fallback,
-            "safe_set_threshold": self._threshold(result.restarts),
-            "score": result.score,
-            "iterations": result.iterations,
-        }
-        out.set(self.action_key, result.actions[:, 0].reshape(*batch, -1))
-        for name, value in decisions.items():
-            out.set(self._plan(name), value.reshape(*batch, 1))
+        mean, std = self._read_warm_start(tensordict, rows)
+        result = self.plan(latent.reshape(rows, latent.shape[-1]), mean, std, noise)
+        space = self.action_spec.space
+        # Once more, in the spec's own dtype: a bound of it may lie between two numbers of float32.
+        action = result.actions[:, 0].to(self.action_spec.dtype).clamp(space.low, space.high)
+        out.set(self.action_key, action.reshape(*batch, action.shape[-1]))
+        self.decisions.write(out, result, self._threshold(result.restarts), batch)
         self.warm_start.write(out, result.mean, result.std)
         return out
 
-    def statistics(self, latent: Tensor, actions: Tensor) -> PlanStatistics:
+    def _read_warm_start(self, tensordict: TensorDictBase, rows: int) -> tuple[Tensor | None, Tensor | None]:
+        if not self.optimizer.uses_warm_start:
+            return None, None
+        mean, std = self.warm_start.read(tensordict, rows)
+        if mean is None and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"LS3Planner found no last plan under {list(self.warm_start.keys.values())} to start from, although "
+                "its optimiser draws candidates round it (p_random below 1). It starts from the whole box, at every "
+                "step unless the environment carries the plan on: append InitTracker() and "
+                "planner.make_tensordict_primer() to the environment, or collect with "
+                "Collector(..., auto_register_policy_transforms=True).",
+                stacklevel=2,
+            )
+        return mean, std
+
+    def imagine_plans(self, latent: Tensor, actions: Tensor) -> PlanStatistics:
         """What the planner imagines of given plans ``[B, N, H, A]`` from latents ``[B, D]``, for pictures."""
-        rows = torch.arange(latent.shape[0], device=latent.device)
-        candidates = 1 if self.common_noise else actions.shape[1]
-        noise = self._draw_imagination(rows, 0)
-        return self.imagine(latent, actions, ImaginationNoise(noise.members, noise.noise[:, :, :, :candidates]))
+        candidates = actions.shape[1]
+        sampled = self._sample_imagination_noise(len(latent), max(candidates, self.optimizer.num_candidates))
+        return self.imagine(
+            latent.float(), actions.float(), sampled._replace(noise=sampled.noise[:, :, :, :candidates])
+        )
 
 
-_DECISIONS = ("feasible", "fallback", "safe_set_threshold", "score", "iterations")
+def _latent_key(encoder: TensorDictModuleBase | None, latent_key: NestedKey) -> NestedKey:
+    """Where the latent lies: under ``latent_key``, or under what an encoder writes instead."""
+    key = unravel_key(latent_key)
+    if encoder is None or key in {unravel_key(out) for out in encoder.out_keys}:
+        return key
+    return posterior_keys(encoder)[0]
 
 
-def describe_plan(tensordict: TensorDictBase, plan_key: NestedKey = "plan") -> TensorDict:
-    """Shares of steps over a collected batch: how often plans were feasible, relaxed, or a fallback.
-
-    Args:
-        tensordict: what a rollout with the planner returned.
-        plan_key: the planner's group.
-
-    Returns:
-        Scalars ``fallback_rate``, ``relaxed_rate`` and ``iterations``.
-    """
-    plan = tensordict.get(plan_key)
-    threshold = plan["safe_set_threshold"]
-    return TensorDict(
-        {
-            "fallback_rate": plan["fallback"].float().mean(),
-            "relaxed_rate": (threshold < threshold.amax() - 1e-6).float().mean(),
-            "iterations": plan["iterations"].float().mean(),
-        }
-    )
+def _not_negative(value: float, name: str) -> float:
+    if not value >= 0.0:
+        raise ValueError(f"{name} must not be negative, got {value}.")
+    return value

@@ -10,7 +10,7 @@ from torchrl.envs import TensorDictPrimer
 
 
 class WarmStart:
-    """Reads and writes the Gaussian that the next plan's candidates are drawn from.
+    """Reads and writes the Gaussian that the next plan's candidates are drawn from, in float32.
 
     Args:
         low: lower bounds of an action, ``[A]``.
@@ -31,11 +31,22 @@ class WarmStart:
     """
 
     def __init__(self, low: Tensor, high: Tensor, horizon: int, plan_key: NestedKey, is_init_key: NestedKey) -> None:
+        low, high = low.float(), high.float()
         self.middle, self.wide = (low + high) / 2, (high - low) / 4
-        self.horizon, self.is_init_key = horizon, is_init_key
+        self.horizon, self.is_init_key = horizon, unravel_key(is_init_key)
         self.keys = {name: unravel_key((plan_key, name)) for name in ("mean", "std")}
 
-    def primer(self) -> TensorDictPrimer:
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What :meth:`read` reads, if it is there."""
+        return [*self.keys.values(), self.is_init_key]
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """What :meth:`write` writes."""
+        return [unravel_key(("next", key)) for key in self.keys.values()]
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
         """The transform that carries the warm start and resets it with the episode."""
         spec = Composite()
         for key in self.keys.values():
@@ -48,8 +59,8 @@ class WarmStart:
         mean, std = (tensordict.get(key, None) for key in self.keys.values())
         if mean is None or std is None:
             return None, None
-        mean = mean.reshape(rows, *mean.shape[-2:])
-        std = std.reshape(rows, *std.shape[-2:])
+        mean = mean.reshape(rows, *mean.shape[-2:]).float()
+        std = std.reshape(rows, *std.shape[-2:]).float()
         is_init = tensordict.get(self.is_init_key, None)
         fresh = (std == 0).all(-1, keepdim=True).all(-2, keepdim=True)
         if is_init is not None:
@@ -63,5 +74,5 @@ class WarmStart:
             "mean": torch.cat([mean[:, 1:], self.middle.expand(rows, 1, -1)], 1),
             "std": torch.cat([std[:, 1:], self.wide.expand(rows, 1, -1)], 1),
         }
-        for name, value in shifted.items():
-            out.set(unravel_key(("next", self.keys[name])), value.reshape(*out.batch_size, *value.shape[1:]))
+        for key, value in zip(self.out_keys, shifted.values(), strict=True):
+            out.set(key, value.reshape(*out.batch_size, *value.shape[1:]))

@@ -3,8 +3,11 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.data import Bounded
 from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives import SoftUpdate
 
 from ls3_torchrl.baselines import AWACLoss, action_value, gaussian_actor
@@ -132,3 +135,52 @@ def test_it_compiles_to_the_same_loss_and_gradients():
     torch.testing.assert_close(*values)
     torch.testing.assert_close(*gradients)
     assert gradients[0]
+
+
+def test_renamed_and_nested_keys():
+    def build(action_key, value_key) -> AWACLoss:
+        torch.manual_seed(0)
+        actor = gaussian_actor(SPEC, 3, hidden=(16,), action_key=action_key)
+        loss = AWACLoss(actor, action_value(SPEC, 3, hidden=(16,), action_key=action_key, value_key=value_key))
+        loss.set_keys(action=action_key, state_action_value=value_key)
+        loss.make_value_estimator(gamma=0.9)
+        SoftUpdate(loss, tau=0.05)
+        return loss
+
+    plain, nested = build("action", "state_action_value"), build(("agent", "move"), ("critic", "q"))
+    assert torch.equal(nested.lowest, plain.lowest)
+    rows = batch()
+    renamed = rows.copy().set(("agent", "move"), rows["action"]).exclude("action")
+    outs = []
+    for loss, td in ((plain, rows), (nested, renamed)):
+        torch.manual_seed(1)
+        outs.append(loss(td))
+    for key in ("loss_actor", "loss_qvalue"):
+        torch.testing.assert_close(outs[0][key], outs[1][key])
+
+
+def test_a_call_by_keyword_equals_one_with_a_tensordict():
+    loss, rows = make(), batch()
+    torch.manual_seed(1)
+    expected = loss(rows.copy())
+    tensors = {key if isinstance(key, str) else "_".join(key): value for key, value in rows.items(True, True)}
+    torch.manual_seed(1)
+    out = loss(**tensors)
+    for key, value in zip(loss.out_keys, out, strict=True):
+        assert torch.equal(value, expected[key])
+
+
+def test_an_actor_without_bounds_is_refused():
+    network = TensorDictModule(nn.Sequential(nn.Linear(3, 2), NormalParamExtractor()), ["loc"], ["l", "s"])
+    actor = ProbabilisticActor(network, in_keys={"loc": "l", "scale": "s"}, distribution_class=TanhNormal)
+    with pytest.raises(ValueError, match=r"AWACLoss needs an actor whose spec bounds one output.*0 of"):
+        AWACLoss(actor, action_value(SPEC, 3))
+
+
+def test_double_precision_gives_the_same_loss():
+    loss, rows = make(), batch()
+    loss.advantage = lambda td: torch.linspace(-1.0, 1.0, td.shape[0])
+    single = loss(rows)["loss_actor"]
+    double = loss.double()(rows.apply(lambda x: x.double() if x.is_floating_point() else x))["loss_actor"]
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(double.float(), single, atol=1e-4, rtol=1e-4)

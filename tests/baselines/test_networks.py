@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import NestedKey, TensorDict
 from torchrl.data import Bounded
 from torchrl.envs import ExplorationType, set_exploration_type
 
@@ -86,3 +86,53 @@ def test_networks_read_images_through_features_of_their_own(make):
     gradients = [p.grad for name, p in network.named_parameters() if "convolutions" in name]
     assert gradients
     assert any(g is not None and g.abs().sum() > 0 for g in gradients)
+
+
+@pytest.mark.parametrize("key", ["move", ("agent", "move")])
+def test_actors_and_critics_take_their_keys(key: NestedKey):
+    def beside(name: str) -> NestedKey:
+        return f"move_{name}" if key == "move" else ("agent", f"move_{name}")
+
+    observation = ("robot", "state")
+    td = TensorDict({"robot": {"state": torch.randn(6, 4)}}, [6])
+    actor = gaussian_actor(box(), 4, hidden=(8,), observation_key=observation, action_key=key)
+    assert actor.in_keys == [observation]
+    assert set(actor.out_keys) == {key, beside("loc"), beside("scale"), beside("log_prob")}
+    written = actor(td.clone())
+    assert written[key].shape == (6, 2)
+    assert written[beside("log_prob")].shape == (6,)
+    policy = deterministic_actor(box(), 4, hidden=(8,), observation_key=observation, action_key=key)
+    action = policy(td.clone())[key]
+    assert ((action >= LOW) & (action <= HIGH)).all()
+    critic = action_value(box(), 4, hidden=(8,), observation_key=observation, action_key=key, value_key=("critic", "q"))
+    assert critic.in_keys == [observation, key]
+    value = critic(td.clone().set(key, action))["critic", "q"]
+    torch.testing.assert_close(value, critic.module(td["robot", "state"], action))
+
+
+def test_the_keys_of_an_actor_that_is_not_told_are_torchrls():
+    assert gaussian_actor(box(), 4).out_keys == ["action_loc", "action_scale", "action", "action_log_prob"]
+    assert deterministic_actor(box(), 4).out_keys == ["action"]
+    assert action_value(box(), 4).out_keys == ["state_action_value"]
+
+
+@pytest.mark.parametrize("pixels", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("make", [gaussian_actor, deterministic_actor, action_value])
+def test_networks_compute_in_the_dtype_they_were_moved_to(make, dtype: torch.dtype, pixels: bool):
+    if pixels:
+        network = make(box(), PixelFeatures.size, observation_key="pixels", features=PixelFeatures(3), hidden=(8,))
+        td = TensorDict({"pixels": torch.randint(256, (3, 3, 64, 64), dtype=torch.uint8)}, [3])
+    else:
+        network, td = make(box(), 4, hidden=(8,)), rows(3)
+    key = "state_action_value" if make is action_value else "action"
+    if make is action_value:
+        td["action"] = torch.tensor([[0.0, 0.01]]).expand(3, 2)
+    before = network(td.clone())[key]
+    # Actions stay as the environment has them, float32; a critic takes them beside observations of any dtype.
+    after = network.to(dtype)(td.apply(lambda x: x.to(dtype) if x.is_floating_point() and x.shape[-1] != 2 else x))[key]
+    assert after.dtype == (torch.float32 if make is gaussian_actor and dtype != torch.float64 else dtype)
+    tolerance = 1e-5 if dtype == torch.float64 else 0.05
+    torch.testing.assert_close(after.double(), before.double(), atol=tolerance, rtol=tolerance)
+    after.sum().backward()
+    assert all(p.grad.dtype == dtype for p in network.parameters() if p.grad is not None)

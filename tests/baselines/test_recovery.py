@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import NestedKey, TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.data import Bounded
@@ -208,3 +208,172 @@ def test_loss_and_switch_compile():
     td = TensorDict({"loc": torch.randn(8, 1)}, [8])
     compiled = torch.compile(policy, backend="aot_eager")
     torch.testing.assert_close(compiled(td.copy())["action"], policy(td.copy())["action"])
+
+
+# Keys and modules of other makes
+
+
+def nested_critic(action_key: NestedKey = ("agent", "move")) -> SafetyCritic:
+    return SafetyCritic(
+        SPEC,
+        1,
+        hidden=(4,),
+        observation_key=("robot", "state"),
+        action_key=action_key,
+        logit_key=("danger", "logit"),
+        risk_key=("danger", "risk"),
+        safety_key=("danger", "safety"),
+    )
+
+
+def test_the_critic_takes_its_keys():
+    critic = nested_critic()
+    assert critic.in_keys == [("robot", "state"), ("agent", "move")]
+    assert critic.out_keys == [("danger", "logit"), ("danger", "risk"), ("danger", "safety")]
+    td = critic(TensorDict({"robot": {"state": torch.randn(5, 1)}, "agent": {"move": torch.zeros(5, 1)}}, [5]))
+    torch.testing.assert_close(td["danger", "risk"], td["danger", "logit"].sigmoid().amax(-1, keepdim=True))
+    assert torch.equal(td["danger", "safety"], -td["danger", "risk"])
+
+
+def test_the_loss_takes_the_critics_keys_and_others_by_set_keys():
+    critic = nested_critic()
+    policy = gaussian_actor(SPEC, 1, hidden=(4,), observation_key=("robot", "state"), action_key=("agent", "move"))
+    loss = lagged(critic, policy)
+    assert loss.in_keys == [
+        ("robot", "state"),
+        ("next", "robot", "state"),
+        ("agent", "move"),
+        ("next", "constraint"),
+    ]
+    z, z_next, action, violated = torch.randn(5, 1), torch.randn(5, 1), torch.randn(5, 1), torch.rand(5, 1) > 0.5
+    batch = TensorDict(
+        {
+            "robot": {"state": z},
+            "agent": {"move": action},
+            "next": {"robot": {"state": z_next}, "constraint": violated},
+        },
+        [5],
+    )
+    torch.manual_seed(1)
+    expected = loss(batch)["loss_safety"]
+    loss.set_keys(observation="z", next_observation=("after", "z"), action="a", constraint=("after", "hit"))
+    renamed = TensorDict({"z": z, "a": action, "after": {"z": z_next, "hit": violated}}, [5])
+    torch.manual_seed(1)
+    assert torch.equal(loss(renamed)["loss_safety"], expected)
+    loss.set_keys(observation=None, next_observation=None, action=None, constraint=None)
+    assert loss.in_keys[:2] == [("robot", "state"), ("next", "robot", "state")]
+
+
+def foreign_critic() -> TensorDictModule:
+    """A critic without members or keys of ours: the logit is z + a / 2."""
+    linear = nn.Linear(2, 1, bias=False)
+    with torch.no_grad():
+        linear.weight.copy_(torch.tensor([[1.0, 0.5]]))
+
+    class Critic(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.linear = linear
+
+        def forward(self, state: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            logit = self.linear(torch.cat([state, action], -1))
+            return logit, logit.sigmoid()
+
+    return TensorDictModule(Critic(), ["state", "u"], [("c", "logit"), ("c", "probability")])
+
+
+def test_the_loss_of_a_critic_and_a_policy_of_other_makes():
+    critic = foreign_critic()
+    policy = TensorDictModule(lambda z: torch.full_like(z, -1.0), [("my", "state")], [("my", "move")])
+    loss = lagged(critic, policy, gamma=0.5)
+    loss.set_keys(risk=("c", "probability"), policy_action=("my", "move"))
+    z, action, z_next = torch.randn(5, 1), torch.randn(5, 1), torch.randn(5, 1)
+    violated = torch.tensor([[True], [False], [False], [True], [False]])
+    batch = TensorDict({"state": z, "u": action, "next": {"state": z_next, "constraint": violated}}, [5])
+    target = torch.where(violated, 1.0, 0.5 * (z_next - 0.5).sigmoid())
+    by_hand = nn.functional.binary_cross_entropy((z + 0.5 * action).sigmoid(), target)
+    losses = loss(batch)
+    torch.testing.assert_close(losses["loss_safety"], by_hand)
+    losses["loss_safety"].backward()
+    assert critic.module.linear.weight.grad.abs().sum() > 0
+    loss.set_keys(risk="risk")
+    with pytest.raises(KeyError, match=r"SafetyCriticLoss, of its critic, needs the keys \['risk'\]"):
+        loss(batch)
+    loss.set_keys(policy_action="action")
+    with pytest.raises(KeyError, match=r"SafetyCriticLoss, of its policy, needs the keys \['action'\]"):
+        loss(batch)
+
+
+def test_recovery_among_modules_of_other_makes_and_keys():
+    task = TensorDictModule(lambda z: (torch.full_like(z, 1.5), z), [("robot", "state")], [("agent", "move"), "note"])
+    recovery = TensorDictModule(lambda z: torch.full_like(z, -1.5), [("robot", "state")], [("agent", "back")])
+    critic = TensorDictModule(lambda z, a: z.sigmoid(), [("robot", "state"), "u"], [("danger", "p")])
+    policy = RecoveryPolicy(
+        task,
+        recovery,
+        critic,
+        0.5,
+        action_key=("agent", "move"),
+        recovery_action_key=("agent", "back"),
+        risk_key=("danger", "p"),
+        task_action_key=("agent", "wanted"),
+        recovered_key=("agent", "recovered"),
+    )
+    z = torch.tensor([[-1.0], [1.0]])
+    td = policy(TensorDict({"robot": {"state": z}}, [2]))
+    assert td["agent", "move"].flatten().tolist() == [1.5, -1.5]
+    assert td["agent", "wanted"].flatten().tolist() == [1.5, 1.5]
+    assert td["agent", "recovered"].flatten().tolist() == [False, True]
+    torch.testing.assert_close(td["danger", "p"], z.sigmoid())
+    assert policy.in_keys == [("robot", "state")]
+    written = {key for key in td.keys(include_nested=True, leaves_only=True) if key != ("robot", "state")}
+    assert written == set(policy.out_keys)
+
+
+def test_the_critics_own_risk_key_is_taken():
+    critic = nested_critic()
+    task = constant(1.0, ("robot", "state"))
+    policy = RecoveryPolicy(task, constant(-1.0, ("robot", "state")), critic, 0.5)
+    assert policy.risk_key == ("danger", "risk")
+    state = torch.randn(4, 1)
+    td = policy(TensorDict({"robot": {"state": state}}, [4]))
+    by_hand = critic.logits(state, torch.ones(4, 1)).amax(-1, keepdim=True).sigmoid()
+    torch.testing.assert_close(td["danger", "risk"], by_hand)
+
+
+@pytest.mark.parametrize(
+    ("role", "options"),
+    [
+        ("task", {"action_key": "move"}),
+        ("recovery", {"recovery_action_key": ("agent", "back")}),
+        ("safety_critic", {"risk_key": "danger"}),
+    ],
+)
+def test_a_module_that_does_not_write_its_key_is_refused(role: str, options: dict):
+    with pytest.raises(
+        ValueError, match=rf"RecoveryPolicy expects {role} to write .*Pass the key as {next(iter(options))}"
+    ):
+        RecoveryPolicy(constant(1.0), constant(-1.0), linear_critic(1.0, 0.0), 0.5, **options)
+
+
+def test_a_risk_that_would_broadcast_over_actions_is_refused():
+    critic = TensorDictModule(lambda z, a: z.squeeze(-1).sigmoid(), ["loc", "action"], ["risk"])
+    policy = RecoveryPolicy(constant(1.0), constant(-1.0), critic, 0.5)
+    with pytest.raises(ValueError, match=r"one risk for each action, of shape \[4, 1\] under 'risk', got \[4\]"):
+        policy(TensorDict({"loc": torch.zeros(4, 1)}, [4]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+def test_the_policy_computes_in_the_dtype_it_was_moved_to(dtype: torch.dtype):
+    critic = SafetyCritic(SPEC, 3, hidden=(8,))
+    policy = RecoveryPolicy(
+        gaussian_actor(SPEC, 3, hidden=(8,)), deterministic_actor(SPEC, 3, hidden=(8,)), critic, 0.5
+    )
+    z = torch.randn(6, 3)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        before = policy(TensorDict({"loc": z}, [6]))
+        after = policy.to(dtype)(TensorDict({"loc": z.to(dtype)}, [6]))
+    assert after["risk"].dtype == dtype
+    tolerance = 1e-5 if dtype == torch.float64 else 0.03
+    for key in ("risk", "task_action"):
+        torch.testing.assert_close(after[key].double(), before[key].double(), atol=tolerance, rtol=tolerance)

@@ -26,7 +26,7 @@ class LineEnv(VisualConstraintEnv):
             seed=seed,
         )
 
-    def _initial_state(self, world: int, generator: np.random.Generator) -> Tensor:
+    def _initial_state(self, index: int, generator: np.random.Generator) -> Tensor:
         return torch.tensor([self.start + 0.01 * generator.normal()], dtype=torch.float32)
 
     def _advance(self, state: Tensor, action: Tensor) -> Tensor:
@@ -185,3 +185,5 @@ def test_any_number_of_states_can_be_pictured_and_a_line_has_no_plane():
     assert images.shape == (3, 3, 4, 4)
     assert images[:, 0, 0, 0].tolist() == [128, 138, 118]
     assert env.plane() is None
+    with pytest.raises(NotImplementedError, match=r"LineEnv does not say .*has a plane\(\) defines advance_noiseless"):
+        env.advance_noiseless(torch.zeros(1, 1), torch.zeros(1, 1))

@@ -8,7 +8,19 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import ls3_envs
-from ls3_envs.gym import GYM_IDS
+
+GYM_IDS = {
+    "ls3/Navigation-v0": "navigation",
+    "ls3/Reacher-v0": "reacher",
+    "ls3/SequentialPushing-v0": "pushing",
+    "ls3/CableRouting-v0": "cable_routing",
+}
+
+
+def test_every_row_has_its_id():
+    assert {row.gym_id: name for name, row in ls3_envs.DOMAINS.items()} == GYM_IDS
+    for name, domain in GYM_IDS.items():
+        assert gymnasium.spec(name).kwargs == {"domain": domain}
 
 
 @pytest.mark.parametrize("name", GYM_IDS)
@@ -75,10 +87,10 @@ def test_one_world_can_start_anew_while_others_go_on():
     envs = ls3_envs.GymVectorEnv("navigation", 2, horizon=4)
     envs.reset(seed=0)
     envs._ended = np.array([True, False])
-    before = envs._worlds.seen["state"].clone()
+    before = envs._batch.seen["state"].clone()
     _, rewards, _, _, _ = envs.step(np.full((2, 2), 1.0, np.float32))
     assert rewards.tolist() == [0.0, -1.0]
-    after = envs._worlds.seen["state"]
+    after = envs._batch.seen["state"]
     assert (after[0] - torch.tensor([30.0, 75.0])).norm() < 6
     assert (after[1] - before[1]).min() > 2
 
@@ -91,9 +103,9 @@ def test_another_render_mode_is_refused():
 def test_plus_and_minus_one_are_the_edges_of_the_domains_box():
     env = gymnasium.make("ls3/Navigation-v0")
     env.reset(seed=0)
-    before = env.unwrapped._worlds.seen["state"].clone()
+    before = env.unwrapped._batch.seen["state"].clone()
     env.step(np.array([1.0, -0.5], np.float32))
-    moved = env.unwrapped._worlds.seen["state"] - before
+    moved = env.unwrapped._batch.seen["state"] - before
     torch.testing.assert_close(moved, torch.tensor([[3.0, -1.5]]), atol=0.6, rtol=0.0)  # noise of 0.125
     with pytest.raises(ValueError, match="outside the action spec"):
         env.unwrapped.step(np.array([1.5, 0.0], np.float32))

@@ -7,7 +7,7 @@ from ls3_envs import collect_offline
 from ls3_envs.pushing import block_positions
 
 
-def shares(name: str, kind: str, episodes: int) -> tuple[float, float, torch.Tensor]:
+def rates(name: str, kind: str, episodes: int) -> tuple[float, float, torch.Tensor]:
     data = collect_offline(name, kind, episodes=episodes, seed=0)
     assert not data["next", "physics_error"].any()
     success, violation = (data["next", key].any(1).float().mean().item() for key in ("success", "constraint"))
@@ -19,7 +19,7 @@ def shares(name: str, kind: str, episodes: int) -> tuple[float, float, torch.Ten
     ("name", "least", "horizon"), [("reacher", 0.85, 100), ("pushing", 0.9, 150), ("cable_routing", 0.9, 50)]
 )
 def test_demonstrations_succeed_violate_nothing_and_leave_room(name, least, horizon):
-    success, violation, returns = shares(name, "success", 20)
+    success, violation, returns = rates(name, "success", 20)
     assert success >= least
     assert violation == 0.0
     assert -horizon < returns.mean() < -horizon / 4
@@ -28,7 +28,7 @@ def test_demonstrations_succeed_violate_nothing_and_leave_room(name, least, hori
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["reacher", "pushing", "cable_routing"])
 def test_violating_data_violate_in_most_trajectories(name):
-    assert shares(name, "constraint", 30)[1] >= 0.6
+    assert rates(name, "constraint", 30)[1] >= 0.6
 
 
 def test_wandering_torques_stay_in_the_box_and_wander():
@@ -63,8 +63,8 @@ def test_pushing_violations_start_from_any_number_of_blocks_in_their_goals():
     data = collect_offline("pushing", "constraint", episodes=40, seed=0)
     y = block_positions(data["state"])[..., 1]
     in_goal = (y > 0.075).sum(-1)
-    shares = torch.bincount(in_goal.flatten(), minlength=4) / in_goal.numel()
-    assert (shares > 0.02).all()
+    fractions = torch.bincount(in_goal.flatten(), minlength=4) / in_goal.numel()
+    assert (fractions > 0.02).all()
 
 
 @pytest.mark.slow

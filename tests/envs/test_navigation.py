@@ -263,7 +263,7 @@ def test_pictures_of_several_worlds_are_those_of_each():
 
 
 def test_the_plane_covers_the_window_row_by_row():
-    plane, extent = NavigationEnv(seed=0).plane(points=6)
+    plane, extent = NavigationEnv(seed=0).plane(points=6)[:2]
     assert plane.shape == (5, 6, 2)
     assert extent == (0.0, 180.0, 150.0, 0.0)  # the picture's top is y = 0
     # Cells of 30 by 30 units, x along the columns and y down the rows.

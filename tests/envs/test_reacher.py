@@ -1,6 +1,8 @@
 """Reacher: geometry of section 1.3.2, seen and computed."""
 
 import math
+import re
+from importlib.resources import files
 
 import mujoco
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 import torch
 
 from ls3_envs import ReacherEnv
-from ls3_envs.reacher import GOAL, OBSTACLE, finger_position, reacher_model
+from ls3_envs.reacher import FINGER_RADIUS, GOAL, OBSTACLE, OBSTACLE_RADIUS, finger_position, reacher_model
 
 
 def test_the_finger_is_where_mujoco_has_it():
@@ -22,7 +24,72 @@ def test_the_finger_is_where_mujoco_has_it():
         np.testing.assert_allclose(finger_position(state), data.geom("finger").xpos[:2], atol=1e-12)
 
 
-def test_the_suites_own_model_with_its_torques_halved():
+def suites_model() -> mujoco.MjModel:
+    """dm_control's own model with this task's goal, stay-out disc and colours, in place."""
+    suite = files(pytest.importorskip("dm_control")) / "suite"
+    names = ("skybox.xml", "visual.xml", "materials.xml")
+    assets = {f"./common/{name}": (suite / "common" / name).read_bytes() for name in names}
+    spec = mujoco.MjSpec.from_string((suite / "reacher.xml").read_text(), include=assets)
+    for light in list(spec.lights):
+        spec.delete(light)
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.5] * 3, [0.5] * 3
+    spec.visual.headlight.specular = [0.0] * 3
+    colours = {"ground": (0.1, 0.15, 0.25), "root": (0.5, 0.4, 0.2), "arm": (0.85, 0.65, 0.2)}
+    colours |= {"hand": (0.85, 0.65, 0.2), "finger": (0.2, 0.7, 1.0), "target": (0.1, 0.9, 0.2)}
+    for geom in spec.geoms:
+        geom.material = ""
+        geom.rgba = [*colours.get(geom.name, (0.25, 0.3, 0.4)), 1.0]
+    target = spec.geom("target")
+    target.type, target.pos, target.size = mujoco.mjtGeom.mjGEOM_CYLINDER, [*GOAL, 0.001], [0.02, 0.001, 0.0]
+    spec.worldbody.add_geom(
+        name="obstacle",
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        pos=[*OBSTACLE, 0.001],
+        size=[OBSTACLE_RADIUS - FINGER_RADIUS, 0.001, 0.0],
+        rgba=[0.9, 0.1, 0.1, 1.0],
+    )
+    return spec.compile()
+
+
+def fields(part: object, prefix: str = "") -> dict[str, object]:
+    """All numbers and arrays of a compiled model, those of ``opt``, ``vis`` and ``stat`` under dotted names."""
+    found: dict[str, object] = {}
+    for name in dir(part):
+        value = None if name.startswith("_") else getattr(part, name)
+        if isinstance(value, (bool, int, float, np.ndarray)):
+            found[prefix + name] = value
+        elif type(value).__module__.startswith("mujoco"):
+            found |= fields(value, f"{prefix}{name}.")
+    return found
+
+
+def test_the_model_is_the_suites_without_its_textures_and_materials():
+    ours, suites = fields(reacher_model()), fields(suites_model())
+    assert ours.keys() == suites.keys()
+    assert {"body_mass", "dof_damping", "geom_rgba", "opt.timestep", "vis.map.znear", "stat.extent"} <= ours.keys()
+    assert len(ours) > 400
+    # Textures, materials, and where names stand in memory, which comes after theirs.
+    left_out = re.compile(r"n?(tex|mat)_?.*|name_(tex|mat|actuator)adr|names_map|nnames(_map)?|nbuffer|signature")
+    different = [name for name in ours if not np.array_equal(ours[name], suites[name])]
+    assert [name for name in different if not left_out.fullmatch(name)] == []
+    # Nothing wears a material, so that leaving them out changes no picture.
+    assert (suites["geom_matid"] == -1).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [("body", "nbody"), ("joint", "njnt"), ("geom", "ngeom"), ("camera", "ncam"), ("actuator", "nu")],
+)
+def test_everything_has_the_suites_name(kind, count):
+    ours, suites = (
+        [getattr(model, kind)(i).name for i in range(getattr(model, count))]
+        for model in (reacher_model(), suites_model())
+    )
+    assert ours == suites
+    assert all(ours)
+
+
+def test_torques_are_half_the_suites():
     model = reacher_model()
     assert model.opt.timestep == 0.02
     assert model.actuator("shoulder").gear[0] == 0.05

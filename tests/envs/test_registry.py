@@ -1,5 +1,8 @@
 """The table of domains: what it builds, collects and refuses."""
 
+import re
+from pathlib import Path
+
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
@@ -10,7 +13,7 @@ from ls3_envs import DOMAINS, NavigationEnv, VisualConstraintEnv, collect_offlin
 def test_navigation_is_in_the_table_with_the_papers_numbers():
     row = domain("navigation")
     assert row is DOMAINS["navigation"]
-    assert row.env is NavigationEnv
+    assert row.env.load() is NavigationEnv
     # 50 demonstrations, 50 violating trajectories, and no additional random data (section 1.3.1).
     assert {kind: data.episodes for kind, data in row.offline.items()} == {"success": 50, "constraint": 50}
 
@@ -113,3 +116,25 @@ def test_unknown_kinds_of_data_are_answered_with_the_known_ones():
 def test_no_episodes_are_refused():
     with pytest.raises(ValueError, match="at least 1, got 0"):
         collect_offline("navigation", "success", episodes=0)
+
+
+def test_the_document_names_every_domain_with_its_id_and_its_episodes():
+    document = (Path(__file__).parents[2] / "docs" / "domains.md").read_text()
+    rows = {
+        line.split("|")[1].strip(): [cell.strip() for cell in line.split("|")[2:-1]]
+        for line in document.splitlines()
+        if line.startswith("| ")
+    }
+    assert [cell.strip("`") for cell in rows["name"]] == list(DOMAINS)
+    assert [cell.strip("`") for cell in rows["Gymnasium"]] == [row.gym_id for row in DOMAINS.values()]
+    for cell, row in zip(rows["success / rand / constraint episodes"], DOMAINS.values(), strict=True):
+        numbers = [re.match(r"\d*", part.strip()).group() for part in cell.split("/")]
+        found = {kind: int(n) for kind, n in zip(("success", "rand", "constraint"), numbers, strict=True) if n}
+        assert found == {kind: data.episodes for kind, data in row.offline.items()}
+
+
+def test_the_documents_python_runs(capsys):
+    document = (Path(__file__).parents[2] / "docs" / "domains.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", document, flags=re.DOTALL)
+    exec(compile(block, "domains.md", "exec"), {})
+    assert "of 8 violated" in capsys.readouterr().out

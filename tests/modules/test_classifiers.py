@@ -67,6 +67,47 @@ def test_nested_keys(kind: type[LatentClassifier], logit_key: str):
     assert logit_key not in td
 
 
+def test_a_classifier_knows_its_name_and_its_label():
+    told = {kind: (kind.name, kind.label_key) for kind, _ in NAMED}
+    assert told == {
+        LatentClassifier: (None, None),
+        SafeSet: ("safe_set", None),
+        ConstraintEstimator: ("constraint", ("next", "constraint")),
+        GoalEstimator: ("goal", ("next", "success")),
+    }
+
+
+def test_a_subclass_is_two_attributes():
+    class Slippery(LatentClassifier):
+        name = "slippery"
+        label_key = ("next", "slippery")
+
+    assert Slippery(8, hidden=(16,)).out_keys == ["slippery_logit"]
+    assert Slippery(8, hidden=(16,), logit_key="ice").out_keys == ["ice"]
+
+
+def test_the_probability_is_that_of_a_forward_of_ones_own():
+    class Shifted(SafeSet):
+        def forward(self, tensordict: TensorDict) -> TensorDict:
+            tensordict = super().forward(tensordict)
+            return tensordict.set("safe_set_logit", tensordict["safe_set_logit"] + 3.0)
+
+    classifier, latent = Shifted(8, hidden=(16,)), torch.randn(4, 8)
+    torch.testing.assert_close(classifier.probability(latent), (classifier.network(latent) + 3.0).sigmoid())
+
+
+@each_classifier
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+def test_it_computes_in_the_dtype_it_was_moved_to(kind: type[LatentClassifier], logit_key: str, dtype: torch.dtype):
+    classifier, latent = kind(8, hidden=(16,), prob_key="p"), torch.randn(4, 8)
+    before = classifier(TensorDict({"latent": latent}, [4]))
+    after = classifier.to(dtype)(TensorDict({"latent": latent.to(dtype)}, [4]))
+    for key in (logit_key, "p"):
+        assert after[key].dtype == dtype
+        tolerance = 1e-6 if dtype == torch.float64 else 0.02
+        torch.testing.assert_close(after[key], before[key].to(dtype), atol=tolerance, rtol=tolerance)
+
+
 @each_classifier
 def test_missing_latent_is_named(kind: type[LatentClassifier], logit_key: str):
     with pytest.raises(KeyError, match=rf"{kind.__name__} needs the keys \['latent'\].*It has: z"):

@@ -147,7 +147,7 @@ def test_log_scale_is_clamped():
     torch.testing.assert_close(scale.flatten(), torch.tensor([math.exp(-2.0), math.exp(1.0)]))
 
 
-def test_drawn_noise_has_the_members_scale():
+def test_sampled_noise_has_the_members_scale():
     dynamics = EnsembleDynamics(1, 1, num_members=1, hidden=())
     with torch.no_grad():
         dynamics.network.weights[0].zero_()
@@ -158,10 +158,10 @@ def test_drawn_noise_has_the_members_scale():
 
 
 @pytest.mark.parametrize(("rows", "members"), [(20, 5), (7, 5), (3, 5), (1, 1), (11, 2)])
-def test_draw_members_splits_as_evenly_as_can_be(rows: int, members: int):
-    drawn = EnsembleDynamics(1, 1, num_members=members, hidden=()).draw_members(rows)
-    counts = torch.bincount(drawn, minlength=members)
-    assert drawn.dtype == torch.int64
+def test_sample_members_splits_as_evenly_as_can_be(rows: int, members: int):
+    sampled = EnsembleDynamics(1, 1, num_members=members, hidden=()).sample_members(rows)
+    counts = torch.bincount(sampled, minlength=members)
+    assert sampled.dtype == torch.int64
     assert counts.sum() == rows
     assert len(counts) == members
     assert counts.max() - counts.min() <= 1
@@ -169,14 +169,14 @@ def test_draw_members_splits_as_evenly_as_can_be(rows: int, members: int):
 
 def test_every_member_is_as_likely_as_another_for_a_row():
     dynamics = EnsembleDynamics(1, 1, num_members=5, hidden=())
-    # With 3 rows for 5 members the remainder must rotate too, else two members would never be drawn.
-    draws = torch.stack([dynamics.draw_members(3) for _ in range(2000)])
+    # With 3 rows for 5 members the remainder must rotate too, else two members would never be sampled.
+    samples = torch.stack([dynamics.sample_members(3) for _ in range(2000)])
     for row in range(3):
-        share = torch.bincount(draws[:, row], minlength=5) / 2000
-        torch.testing.assert_close(share, torch.full((5,), 0.2), atol=0.04, rtol=0)
+        fraction = torch.bincount(samples[:, row], minlength=5) / 2000
+        torch.testing.assert_close(fraction, torch.full((5,), 0.2), atol=0.04, rtol=0)
 
 
-def test_ts1_draws_members_anew_at_every_step():
+def test_ts1_samples_members_anew_at_every_step():
     dynamics = shifting_dynamics(5)
     td = dynamics(rest(40))
     first = members_used(td)
@@ -247,3 +247,21 @@ def test_bad_options_are_refused():
         EnsembleDynamics(3, 2, log_scale_bounds=(1.0, 1.0))
     with pytest.raises(ValueError, match="num_members must be at least 1"):
         EnsembleDynamics(3, 2, num_members=0)
+
+
+@pytest.mark.parametrize("control_affine", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+def test_it_computes_in_the_dtype_it_was_moved_to(dtype: torch.dtype, control_affine: bool):
+    dynamics = EnsembleDynamics(3, 2, hidden=(16,), control_affine=control_affine, action_scale=[0.5, 2.0])
+    td = TensorDict(
+        {"latent": torch.randn(6, 3), "action": torch.randn(6, 2), "dynamics_noise": torch.randn(6, 3)}, [6]
+    )
+    td["dynamics_member"] = torch.arange(6).unsqueeze(-1) % 5
+    before = dynamics(td.clone())["next", "latent"]
+    moved = td.apply(lambda x: x.to(dtype) if x.is_floating_point() else x)
+    after = dynamics.to(dtype)(moved)["next", "latent"]
+    assert after.dtype == dtype
+    assert dynamics.action_scale.dtype == dtype
+    tolerance = 1e-5 if dtype == torch.float64 else 0.05
+    torch.testing.assert_close(after, before.to(dtype), atol=tolerance, rtol=tolerance)
+    assert dynamics(moved.exclude("dynamics_noise", "dynamics_member"))["next", "latent"].dtype == dtype

@@ -86,7 +86,7 @@ def test_bytes_and_unit_floats_are_the_same_image():
         torch.testing.assert_close(from_bytes["loc"], from_floats["loc"], atol=1e-5, rtol=1e-4)
     # Black and white reach the network as 0 and 1.
     extremes = torch.tensor([0, 255], dtype=torch.uint8).view(2, 1, 1, 1).expand(2, 3, 64, 64)
-    scaled = as_unit_pixels(extremes, 3)
+    scaled = as_unit_pixels(extremes)
     assert (scaled[0] == 0).all()
     assert (scaled[1] == 1).all()
 
@@ -210,34 +210,6 @@ def test_sizes_below_one_are_refused():
         PixelEncoder(latent_dim=0)
 
 
-@pytest.mark.parametrize("autocast", [False, True])
-@pytest.mark.parametrize(
-    ("kind", "which", "size"),
-    [(nn.Conv2d, 0, 4), *((nn.ConvTranspose2d, i, size) for i, size in enumerate((1, 5, 13, 30)))],
-)
-def test_layers_made_for_speed_equal_the_convolution_with_its_gradients(
-    kind: type, which: int, size: int, autocast: bool
-):
-    torch.manual_seed(0)
-    modules = [*PixelEncoder(latent_dim=4).modules(), *PixelDecoder(latent_dim=4).modules()]
-    layer = [m for m in modules if isinstance(m, kind) and type(m) is not kind][which]
-    with torch.no_grad():
-        layer.bias += torch.randn_like(layer.bias)  # a bias that matters
-    x = torch.randn(3, layer.in_channels, size, size, requires_grad=True)
-    weight = None
-    results = []
-    for forward in (layer.forward, lambda x: kind.forward(layer, x)):
-        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
-            out = forward(x)
-        weight = torch.randn_like(out) if weight is None else weight
-        results.append([out, *torch.autograd.grad((weight * out).sum(), [x, *layer.parameters()])])
-    for ours, theirs in zip(*results, strict=True):
-        assert ours.dtype == theirs.dtype
-        # Of the largest value; bf16 keeps eight bits.
-        tolerance = (0.02 if autocast else 1e-4) * float(theirs.detach().abs().max())
-        torch.testing.assert_close(ours, theirs, atol=tolerance, rtol=1e-4)
-
-
 def test_rescaled_latents_are_the_same_posteriors_in_another_unit_and_decode_alike():
     torch.manual_seed(0)
     encoder, decoder = PixelEncoder(latent_dim=4), PixelDecoder(latent_dim=4)
@@ -287,3 +259,25 @@ def test_the_decoder_compiles_as_one_graph_with_the_same_gradients():
     results = [torch.autograd.grad(f(latent), list(decoder.parameters())) for f in (error, compiled)]
     for ours, theirs in zip(*results, strict=True):
         torch.testing.assert_close(ours, theirs)
+
+
+@pytest.mark.parametrize("as_floats", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+def test_both_halves_compute_in_the_dtype_they_were_moved_to(dtype: torch.dtype, as_floats: bool):
+    encoder, decoder = PixelEncoder(latent_dim=4), PixelDecoder(latent_dim=4, background=True)
+    decoder.set_background(torch.rand(3, 64, 64))
+    pixels = some_pixels(2) / 255 if as_floats else some_pixels(2)
+    before = decoder(encoder(TensorDict({"pixels": pixels}, [2])))
+    after = decoder.to(dtype)(encoder.to(dtype)(TensorDict({"pixels": pixels}, [2])))
+    for key in ("loc", "scale", "latent", "reco_pixels"):
+        assert after[key].dtype == dtype
+        tolerance = 1e-5 if dtype == torch.float64 else 0.02
+        torch.testing.assert_close(after[key], before[key].to(dtype), atol=tolerance, rtol=tolerance)
+    after["reco_pixels"].sum().backward()
+    assert all(p.grad.dtype == dtype for p in [*encoder.parameters(), *decoder.parameters()])
+
+
+def test_bytes_are_scaled_in_double_precision_where_it_is_asked_for():
+    pixels = torch.tensor([[[[51]]]], dtype=torch.uint8)
+    assert as_unit_pixels(pixels, torch.float64).item() == 51 / 255
+    assert as_unit_pixels(pixels).dtype == torch.float32

@@ -5,6 +5,8 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import nn
 
 from ls3_torchrl.modules import EnsembleDynamics
 from ls3_torchrl.objectives import EnsembleDynamicsLoss
@@ -176,3 +178,62 @@ def test_loss_compiles_in_one_graph():
     batch["next"] = {"latent": torch.randn(6, 4)}
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(batch)["loss_dynamics"], loss(batch)["loss_dynamics"])
+
+
+# Dynamics of other makes
+
+
+class Single(TensorDictModuleBase):
+    """One network without members: the mean is z + w a, the spread a constant."""
+
+    in_keys = [("model", "z"), ("model", "a")]  # noqa: RUF012
+    out_keys = [("model", "next_z")]  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor(0.5))
+
+    def distribution(self, latent: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        mean = latent + self.weight * action
+        return mean, torch.full_like(mean, 2.0)
+
+
+def test_a_single_network_that_gives_mean_and_standard_deviation():
+    dynamics = Single()
+    loss = EnsembleDynamicsLoss(dynamics)
+    loss.set_keys(latent=("now", "z"))
+    z, a, z_next = [0.0, 2.0, -1.0], [1.0, -1.0, 0.5], [0.4, 2.0, 1.5]
+    rows = {"action": torch.tensor(a)[:, None], "next": {"latent": torch.tensor(z_next)[:, None]}}
+    out = loss(TensorDict({"now": {"z": torch.tensor(z)[:, None]}, **rows}, [3]))
+    by_hand = -sum(log_density(y, x + 0.5 * u, 2.0) for x, u, y in zip(z, a, z_next, strict=True)) / 3
+    assert out["loss_dynamics"].item() == pytest.approx(by_hand, rel=1e-5)
+    out["loss_dynamics"].backward()
+    assert dynamics.weight.grad.abs() > 0
+
+
+def test_dynamics_that_lack_a_method_are_told_what_is_needed():
+    plain = TensorDictModule(lambda z, a: z + a, ["latent", "action"], [("next", "latent")])
+    with pytest.raises(
+        TypeError, match=r"method distribution\(latent, action\).*TensorDictModule has none.*Prediction"
+    ):
+        EnsembleDynamicsLoss(plain)
+    with pytest.raises(
+        TypeError, match=r"steps=3\) needs dynamics with a method unroll\(latent, action\).*Single has none"
+    ):
+        EnsembleDynamicsLoss(Single(), steps=3)
+    with pytest.raises(TypeError, match=r"EnsembleDynamicsLoss\(bootstrap=True\) needs an ensemble.*Single is none"):
+        EnsembleDynamicsLoss(Single(), bootstrap=True)
+
+
+def test_a_distribution_of_ones_own_is_not_bypassed():
+    class Still(EnsembleDynamics):
+        def distribution(self, latent, action, *, per_member=False):
+            loc, scale = super().distribution(latent, action, per_member=per_member)
+            return 0.0 * loc, 0.0 * scale + 1.0
+
+    batch = transitions([0.5, -2.0], [1.0, 3.0])
+    out = EnsembleDynamicsLoss(Still(1, 1, hidden=()))(batch)
+    assert out["prediction_error"].item() == pytest.approx((1.0 + 9.0) / 2)
+    stretches = transitions([[0.5, 1.0]], [[1.0, 3.0]])
+    out = EnsembleDynamicsLoss(Still(1, 1, hidden=()), steps=2)(stretches)
+    assert out["prediction_error"].item() == pytest.approx((1.0 + 9.0) / 2)

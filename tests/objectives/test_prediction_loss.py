@@ -3,6 +3,8 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
 
 from ls3_torchrl.modules import EnsembleDynamics, PixelEncoder
 from ls3_torchrl.objectives import LatentPredictionLoss
@@ -94,3 +96,40 @@ def test_missing_keys_are_named():
         LatentPredictionLoss(grey_reader(), movers())(
             TensorDict({"pixels": images(0.2), "next": {"pixels": images(0.4)}}, [1])
         )
+
+
+# Modules of other makes
+
+
+@pytest.mark.parametrize("out_keys", [["latent"], [("q", "z")], ["loc", "scale"]])
+@pytest.mark.parametrize("steps", [1, 2])
+def test_any_encoder_and_any_dynamics(out_keys: list, steps: int):
+    halved = nn.Linear(2, 2, bias=False)
+    nn.init.constant_(halved.weight, 0.5)
+    encoder = TensorDictModule(lambda x: (halved(x),) * len(out_keys), [("robot", "state")], out_keys)
+    moving = nn.Linear(1, 2, bias=False)
+    dynamics = TensorDictModule(
+        lambda z, a: (z + moving(a), a), [("model", "z"), ("model", "a")], [("model", "next_z"), "something"]
+    )
+    loss = LatentPredictionLoss(encoder, dynamics)
+    loss.set_keys(pixels="state", next_pixels=("next", "state"))
+    state, after, action = torch.randn(5, 2), torch.randn(5, 2), torch.randn(5, steps, 1)
+    batch = TensorDict({"state": state, "action": action if steps > 1 else action[:, 0], "next": {"state": after}}, [5])
+    out = loss(batch)["loss_prediction"]
+    by_hand = halved(state) + sum(moving(action[:, k]) for k in range(steps)) - halved(after)
+    torch.testing.assert_close(out, by_hand.square().mean())
+    out.backward()
+    assert halved.weight.grad.abs().sum() > 0
+    assert moving.weight.grad.abs().sum() > 0
+
+
+def test_a_subclass_of_the_pixel_encoder_is_not_bypassed():
+    class Far(PixelEncoder):
+        def forward(self, tensordict: TensorDict) -> TensorDict:
+            tensordict = super().forward(tensordict)
+            return tensordict.set("loc", torch.tensor([[3.0], [7.0]]))
+
+    loss = LatentPredictionLoss(Far(latent_dim=1), movers())
+    batch = TensorDict({"pixels": images(0.2), "action": torch.tensor([[1.0]]), "next": {"pixels": images(0.4)}}, [1])
+    # Imagined: 4 and 5.
+    assert loss(batch)["loss_prediction"].item() == pytest.approx((3.0**2 + 2.0**2) / 2)

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import HardUpdate
 
@@ -217,3 +218,28 @@ def test_loss_compiles_in_one_graph():
     batch["next"] = {"latent": torch.randn(6, 4)}
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(batch)["loss_safe_set"], loss(batch)["loss_safe_set"])
+
+
+def test_any_module_whose_first_output_is_a_logit_is_a_safe_set():
+    foreign = TensorDictModule(nn.Linear(1, 1, bias=False), [("m", "z")], [("m", "score")])
+    nn.init.constant_(foreign.module.weight, 2.0)
+    batch = transitions([0.3, -1.0], [1.0, 2.0], [True, False])
+    ours, theirs = lagged_loss(foreign), lagged_loss(linear_safe_set(2.0))
+    assert torch.equal(ours(batch)["loss_safe_set"], theirs(batch)["loss_safe_set"])
+    before = ours.target(batch["next", "latent"], batch["in_success"])
+    ours(batch)["loss_safe_set"].backward()
+    assert foreign.module.weight.grad.abs().sum() > 0
+    with torch.no_grad():
+        foreign.module.weight.fill_(-1.0)
+    assert torch.equal(ours.target(batch["next", "latent"], batch["in_success"]), before)
+
+
+def test_a_safe_sets_own_forward_is_not_bypassed():
+    class Certain(SafeSet):
+        def forward(self, tensordict: TensorDict) -> TensorDict:
+            tensordict = super().forward(tensordict)
+            return tensordict.set("safe_set_logit", 0.0 * tensordict["safe_set_logit"] + 3.0)
+
+    loss = lagged_loss(Certain(1, hidden=()), gamma=0.5)
+    out = loss(transitions([0.3], [1.0], [False]))
+    assert out["loss_safe_set"].item() == pytest.approx(cross_entropy(sigmoid(3.0), 0.5 * sigmoid(3.0)), rel=1e-5)

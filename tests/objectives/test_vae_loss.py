@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from ls3_torchrl.modules import PixelDecoder, PixelEncoder
@@ -153,6 +154,12 @@ def test_bytes_and_floats_give_one_loss():
     assert loss(as_bytes)["reconstruction"].item() == pytest.approx((0.25 - 0.2) ** 2, rel=1e-5)
 
 
+def test_in_double_precision_the_images_are_scaled_in_it():
+    loss = constant_vae(0.25).double()
+    out = loss(TensorDict({"pixels": torch.full((2, 3, 64, 64), 51, dtype=torch.uint8)}, [2]))
+    assert out["reconstruction"].item() == pytest.approx((0.25 - 0.2) ** 2, rel=1e-12)
+
+
 def test_modules_with_keys_of_their_own_and_an_untouched_batch():
     encoder = PixelEncoder(
         latent_dim=2, pixels_key=("a", "x"), loc_key=("b", "m"), scale_key=("b", "s"), latent_key=("b", "z")
@@ -204,3 +211,97 @@ def test_encoder_and_decoder_overfit_four_images(minimise):
     first, last = minimise(loss, TensorDict({"pixels": pixels}, [4]), "loss_vae", steps=60, lr=1e-3)
     assert first > variance
     assert last < 0.25 * variance
+
+
+# Encoders and decoders of other makes
+
+
+class _Brightness(nn.Module):
+    """Any image to a posterior around its brightness, in bytes."""
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        self.seen = images
+        mean = images.to(torch.float32).mean((-3, -2, -1)).unsqueeze(-1) / 255
+        return mean, torch.full_like(mean, 0.5)
+
+
+def of_another_make(size: int, keys: tuple, decoder_keys: tuple) -> tuple[TensorDictModule, TensorDictModule]:
+    encoder = TensorDictModule(_Brightness(), [keys[0]], list(keys[1:]))
+    decoder = nn.Sequential(nn.Linear(1, 3 * size * size), nn.Unflatten(-1, (3, size, size)))
+    return encoder, TensorDictModule(decoder, [decoder_keys[0]], [decoder_keys[1]])
+
+
+@pytest.mark.parametrize(
+    ("keys", "decoder_keys"),
+    [
+        (("pixels", "loc", "scale"), ("latent", "reco_pixels")),
+        ((("eye", "x"), ("q", "loc"), ("q", "scale")), (("q", "z"), ("eye", "reco"))),
+    ],
+)
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+def test_any_encoder_and_decoder_of_any_images(keys: tuple, decoder_keys: tuple, reduction: str):
+    encoder, decoder = of_another_make(8, keys, decoder_keys)
+    loss = VAELoss(encoder, decoder, beta=0.1, reduction=reduction)
+    loss.set_keys(pixels=("camera", "front"))
+    images = torch.randint(256, (4, 3, 8, 8), dtype=torch.uint8)
+    torch.manual_seed(1)
+    out = loss(TensorDict({"camera": {"front": images}}, [4]))
+    assert encoder.module.seen is images  # as they are in the batch: only PixelEncoder is known to take floats as well
+    torch.manual_seed(1)
+    loc = images.float().mean((1, 2, 3))[:, None] / 255
+    made = decoder.module(loc + 0.5 * torch.randn(4, 1))
+    error = (made - images / 255).square()
+    kl = (0.5 * (0.25 + loc**2 - 1) - math.log(0.5)).mean()
+    by_hand = (error.mean() if reduction == "mean" else error.sum() / 4) + 0.1 * kl
+    torch.testing.assert_close(out["loss_vae"], by_hand)
+    out["loss_vae"].backward()
+    assert decoder.module[0].weight.grad.abs().sum() > 0
+
+
+def test_states_can_be_encoded_as_well_as_images():
+    class Wide(nn.Module):
+        def forward(self, state: Tensor) -> tuple[Tensor, Tensor]:
+            return state[..., :1], torch.ones_like(state[..., :1])
+
+    encoder = TensorDictModule(Wide(), ["state"], ["loc", "scale"])
+    decoder = TensorDictModule(nn.Linear(1, 5), ["latent"], ["reco"])
+    loss = VAELoss(encoder, decoder)
+    loss.set_keys(pixels="state")
+    state = torch.randn(4, 5)
+    torch.manual_seed(1)
+    out = loss(state=state)
+    torch.manual_seed(1)
+    torch.testing.assert_close(out[1], (decoder.module(state[:, :1] + torch.randn(4, 1)) - state).square().mean())
+
+
+def test_a_subclass_of_the_pixel_encoder_is_not_bypassed():
+    class Darkened(PixelEncoder):
+        def forward(self, tensordict: TensorDict) -> TensorDict:
+            assert tensordict["pixels"].dtype == torch.uint8
+            tensordict = super().forward(tensordict.set("pixels", tensordict["pixels"] // 4))
+            return tensordict.set("loc", 5.0 + 0.0 * tensordict["loc"])
+
+    loss = VAELoss(Darkened(latent_dim=2), PixelDecoder(latent_dim=2))
+    out = loss(TensorDict({"pixels": torch.full((2, 3, 64, 64), 51, dtype=torch.uint8)}, [2]))
+    # A mean of 5 in each dimension is 12.5 nats from the prior; an encoder's own forward gives about 2.
+    assert out["kl"].item() > 12.5
+
+
+def test_hooks_of_the_pixel_encoder_are_called():
+    encoder, calls = PixelEncoder(latent_dim=2), []
+    encoder.register_forward_hook(lambda *_: calls.append(1))
+    VAELoss(encoder, PixelDecoder(latent_dim=2))(TensorDict({"pixels": greys(0.5)}, [1]))
+    assert calls == [1]
+
+
+@pytest.mark.parametrize("out_keys", [["latent"], ["loc"], ["z"]])
+def test_an_encoder_without_a_standard_deviation_is_refused(out_keys: list[str]):
+    encoder = TensorDictModule(nn.Flatten(), ["pixels"], out_keys)
+    with pytest.raises(ValueError, match=r"VAELoss needs an encoder .*'scale'; TensorDictModule writes .*Prediction"):
+        VAELoss(encoder, PixelDecoder(latent_dim=2))
+
+
+def test_images_that_the_decoder_does_not_make_are_refused():
+    encoder, decoder = of_another_make(8, ("pixels", "loc", "scale"), ("latent", "reco"))
+    with pytest.raises(ValueError, match=r"decoder writes images of shape \[2, 3, 8, 8\] .* shape \[2, 3, 64, 64\]"):
+        VAELoss(encoder, decoder)(TensorDict({"pixels": greys(0.1, 0.2)}, [2]))

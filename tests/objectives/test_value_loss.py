@@ -5,6 +5,8 @@ from collections.abc import Callable
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.objectives import HardUpdate
 
 from ls3_torchrl.modules import ValueEnsemble
@@ -282,3 +284,60 @@ def test_td1_loss_compiles_in_one_graph():
     batch["next"] = {"latent": torch.randn(6, 4), "reward": column([-1.0, 0.0] * 3)}
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(batch)["loss_value"], loss(batch)["loss_value"])
+
+
+# Values of other makes
+
+
+def single_value(slope: float) -> TensorDictModule:
+    """One value, without members, under keys of its own."""
+    value = TensorDictModule(nn.Linear(1, 1, bias=False), [("model", "z")], [("model", "v")])
+    nn.init.constant_(value.module.weight, slope)
+    return value
+
+
+@pytest.mark.parametrize("monte_carlo", [False, True])
+def test_a_single_value_learns_as_an_ensemble_of_one(monte_carlo: bool):
+    batch = steps([0.5, 3.0], [1.5, 2.0], [-1.0, 0.0]).set("reward_to_go", column([-2.0, -1.5]))
+    single, ensemble = single_value(2.0), linear_value(2.0)
+    for make, options in ((OfflineValueLoss, {}), (td1_loss, {"gamma": 0.5, "monte_carlo": monte_carlo})):
+        ours, theirs = make(single, **options)(batch), make(ensemble, **options)(batch)
+        torch.testing.assert_close(ours["loss_value"], theirs["loss_value"])
+        ours["loss_value"].backward()
+        theirs["loss_value"].backward()
+        torch.testing.assert_close(single.module.weight.grad, ensemble.network.weights[0].grad[0])
+
+
+def test_a_single_values_target_lags_and_has_its_own_shape():
+    value = single_value(2.0)
+    loss = td1_loss(value, gamma=0.5)
+    with torch.no_grad():
+        value.module.weight.fill_(7.0)
+    assert loss.target(column([3.0]), column([-1.0])).tolist() == [[-1 + 0.5 * 2.0 * 3.0]]
+
+
+@pytest.mark.parametrize("make", [OfflineValueLoss, td1_loss])
+def test_bootstrap_batches_need_an_ensemble(make: Callable):
+    with pytest.raises(TypeError, match=r"bootstrap=True\) needs an ensemble.*TensorDictModule is none"):
+        make(single_value(1.0), bootstrap=True)
+
+
+@pytest.mark.parametrize("make", [OfflineValueLoss, td1_loss])
+def test_values_without_a_last_dimension_are_refused(make: Callable):
+    # Against targets [B, 1] they would broadcast to [B, B].
+    flat = TensorDictModule(nn.Sequential(nn.Linear(1, 1), nn.Flatten(0)), ["latent"], ["v"])
+    batch = steps([0.5, 3.0], [1.5, 2.0], [-1.0, 0.0]).set("reward_to_go", column([-2.0, -1.5]))
+    with pytest.raises(ValueError, match=r"targets of shape \[2, 1\] with predictions of shape \[2\]"):
+        make(flat)(batch)
+
+
+def test_a_values_own_forward_is_not_bypassed():
+    class Shifted(ValueEnsemble):
+        def forward(self, tensordict: TensorDict, *, per_member: bool = False) -> TensorDict:
+            tensordict = super().forward(tensordict, per_member=per_member)
+            return tensordict.set("state_value", 10.0 + 0.0 * tensordict["state_value"])
+
+    batch = steps([0.5], [1.5], [-1.0]).set("reward_to_go", column([-2.0]))
+    assert OfflineValueLoss(Shifted(1, hidden=()))(batch)["loss_value"].item() == pytest.approx(12.0**2)
+    td1 = td1_loss(Shifted(1, hidden=()), gamma=0.5)
+    assert td1(batch)["loss_value"].item() == pytest.approx((10.0 - (-1 + 5.0)) ** 2)

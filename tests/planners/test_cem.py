@@ -7,29 +7,29 @@ LOW, HIGH = torch.tensor([-3.0, 0.5]), torch.tensor([-1.0, 2.0])
 
 
 def quadratic(target):
-    def judge(actions, rows, restarts, iteration):
+    def score_plans(actions, rows, restarts, iteration):
         score = -(actions - torch.as_tensor(target)).square().sum((-1, -2))
         return PlanScores(score, torch.ones_like(score, dtype=torch.bool), score)
 
-    return judge
+    return score_plans
 
 
 class Record:
-    """Passes a judgement on and remembers everything that was asked."""
+    """Passes scores on and remembers everything that was asked."""
 
-    def __init__(self, judge):
-        self.judge, self.asked = judge, []
+    def __init__(self, score_plans):
+        self.score_plans, self.asked = score_plans, []
 
     def __call__(self, actions, rows, restarts, iteration):
-        judgement = self.judge(actions, rows, restarts, iteration)
-        self.asked.append((actions.clone(), rows.clone(), restarts.clone(), iteration, judgement))
-        return judgement
+        scores = self.score_plans(actions, rows, restarts, iteration)
+        self.asked.append((actions.clone(), rows.clone(), restarts.clone(), iteration, scores))
+        return scores
 
 
-def table(batch, cem, horizon, action_dim=2, seed=0):
+def table(batch, cem, horizon, action_dim=2, seed=0, max_restarts=5):
     """Noise that depends on row and iteration alone, whatever else is asked for."""
     generator = torch.Generator().manual_seed(seed)
-    shape = (cem.max_iterations, batch, cem.num_candidates, horizon, action_dim)
+    shape = (cem.max_iterations(max_restarts), batch, cem.num_candidates, horizon, action_dim)
     normal, uniform = torch.randn(shape, generator=generator), torch.rand(shape, generator=generator)
     return normal, uniform, lambda rows, iteration: (normal[iteration][rows], uniform[iteration][rows])
 
@@ -68,8 +68,8 @@ def test_one_elite_refits_on_the_best_alone():
     cem = CrossEntropyMethod(num_candidates=50, num_elites=1, optim_steps=3, min_std=0.0)
     record = Record(quadratic([-2.0, 1.0]))
     result = cem(record, LOW, HIGH, batch=1, horizon=2)
-    actions, *_, judgement = record.asked[0]
-    torch.testing.assert_close(result.actions[0], actions[0, judgement.score[0].argmax()])
+    actions, *_, scores = record.asked[0]
+    torch.testing.assert_close(result.actions[0], actions[0, scores.score[0].argmax()])
     torch.testing.assert_close(result.mean, result.actions)
     assert (result.std == 0).all()
     # Without any spread the later rounds repeat it.
@@ -88,9 +88,9 @@ def test_elites_refit_by_hand():
     cem = CrossEntropyMethod(num_candidates=30, num_elites=4, optim_steps=1)
     record = Record(quadratic([-2.0, 1.0]))
     result = cem(record, LOW, HIGH, batch=2, horizon=2)
-    actions, *_, judgement = record.asked[0]
+    actions, *_, scores = record.asked[0]
     for row in range(2):
-        elite = actions[row, judgement.score[row].argsort(descending=True)[:4]]
+        elite = actions[row, scores.score[row].argsort(descending=True)[:4]]
         torch.testing.assert_close(result.mean[row], elite.mean(0))
         torch.testing.assert_close(result.std[row], elite.std(0, correction=0))
 
@@ -131,15 +131,15 @@ def test_nan_ranks_last():
 def test_scores_that_rank_nothing_count_as_infeasible_and_never_leave_the_box(worthless):
     torch.manual_seed(0)
 
-    def judge(actions, rows, restarts, iteration):
+    def score_plans(actions, rows, restarts, iteration):
         score = torch.full((1, 10), worthless)
         fallback = torch.full((1, 10), torch.nan)
         fallback[0, 4] = -1e6
         return PlanScores(score, torch.ones(1, 10, dtype=torch.bool), fallback)
 
-    record = Record(judge)
-    cem = CrossEntropyMethod(num_candidates=10, num_elites=5, optim_steps=2, max_restarts=1)
-    result = cem(record, LOW, HIGH, batch=1, horizon=2)
+    record = Record(score_plans)
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=5, optim_steps=2)
+    result = cem(record, LOW, HIGH, batch=1, horizon=2, max_restarts=1)
     assert result.fallback.tolist() == [True]
     # The only candidate with a ranking wins over those without.
     assert torch.equal(result.actions[0], record.asked[-1][0][0, 4])
@@ -156,17 +156,17 @@ def test_nothing_feasible_restarts_and_then_takes_the_best_fallback(max_restarts
         return PlanScores(-ranking, torch.zeros_like(ranking, dtype=torch.bool), ranking)
 
     record = Record(never)
-    cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3, max_restarts=max_restarts)
-    result = cem(record, LOW, HIGH, batch=2, horizon=2)
+    cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3)
+    result = cem(record, LOW, HIGH, batch=2, horizon=2, max_restarts=max_restarts)
     assert result.fallback.tolist() == [True, True]
     assert result.restarts.tolist() == [max_restarts] * 2
     assert result.iterations.tolist() == [max_restarts + 1] * 2
     assert [asked[2].tolist() for asked in record.asked] == [[k, k] for k in range(max_restarts + 1)]
-    actions, *_, judgement = record.asked[-1]
+    actions, *_, scores = record.asked[-1]
     for row in range(2):
-        best = judgement.fallback[row].argmax()
+        best = scores.fallback[row].argmax()
         assert torch.equal(result.actions[row], actions[row, best])
-        assert result.score[row] == judgement.fallback[row, best]
+        assert result.score[row] == scores.fallback[row, best]
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
@@ -177,8 +177,8 @@ def test_feasible_only_after_k_restarts(k):
         score = -(actions + 2).square().sum((-1, -2))
         return PlanScores(score, (restarts >= k)[:, None].expand_as(score), score)
 
-    cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3, max_restarts=4)
-    result = cem(later, LOW, HIGH, batch=1, horizon=2)
+    cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3)
+    result = cem(later, LOW, HIGH, batch=1, horizon=2, max_restarts=4)
     assert result.restarts.tolist() == [k]
     assert result.iterations.tolist() == [k + 3]  # the failed ones, then all rounds
     assert result.fallback.tolist() == [False]
@@ -186,16 +186,16 @@ def test_feasible_only_after_k_restarts(k):
 
 def test_a_restart_begins_again_from_the_given_gaussian():
     # Feasible at first, nothing in the second round, feasible again after the restart.
-    def judge(actions, rows, restarts, iteration):
+    def score_plans(actions, rows, restarts, iteration):
         score = actions[..., 0].sum(-1)
         return PlanScores(score, torch.full_like(score, iteration != 1, dtype=torch.bool), score)
 
-    cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=2, max_restarts=2, p_random=0.0)
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=2, p_random=0.0)
     normal, _, noise = table(1, cem, 2)
-    record = Record(judge)
+    record = Record(score_plans)
     mean = torch.tensor([-2.0, 1.2]).expand(1, 2, 2)
     std = torch.full((1, 2, 2), 0.1)
-    result = cem(record, LOW, HIGH, batch=1, horizon=2, mean=mean, std=std, noise=noise)
+    result = cem(record, LOW, HIGH, batch=1, horizon=2, max_restarts=2, mean=mean, std=std, noise=noise)
     assert result.restarts.tolist() == [1]
     assert result.iterations.tolist() == [4]
     torch.testing.assert_close(record.asked[2][0], (mean[:, None] + 0.1 * normal[2]).clamp(LOW, HIGH))
@@ -211,12 +211,12 @@ def test_a_feasible_sequence_of_an_earlier_round_beats_a_fallback():
         return PlanScores(score, torch.full_like(score, iteration == 0, dtype=torch.bool), -score)
 
     record = Record(only_at_first)
-    cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3, max_restarts=1)
-    result = cem(record, LOW, HIGH, batch=1, horizon=2)
+    cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3)
+    result = cem(record, LOW, HIGH, batch=1, horizon=2, max_restarts=1)
     assert result.fallback.tolist() == [False]
-    actions, *_, judgement = record.asked[0]
-    assert torch.equal(result.actions[0], actions[0, judgement.score[0].argmax()])
-    assert result.score[0] == judgement.score.max()
+    actions, *_, scores = record.asked[0]
+    assert torch.equal(result.actions[0], actions[0, scores.score[0].argmax()])
+    assert result.score[0] == scores.score.max()
 
 
 def test_rows_are_independent():
@@ -224,27 +224,28 @@ def test_rows_are_independent():
     needs = torch.tensor([0, 2, 99])
     targets = torch.tensor([[-2.4, 1.1], [-1.2, 0.6], [-2.9, 1.9]])
 
-    def judge_of(which):
-        def judge(actions, rows, restarts, iteration):
+    def score_plans_of(which):
+        def score_plans(actions, rows, restarts, iteration):
             row = which[rows]
             score = -(actions - targets[row][:, None, None]).square().sum((-1, -2))
             return PlanScores(score, (restarts >= needs[row])[:, None].expand_as(score), 2 * score)
 
-        return judge
+        return score_plans
 
-    cem = CrossEntropyMethod(num_candidates=40, num_elites=5, optim_steps=3, max_restarts=3, p_random=0.5)
+    cem = CrossEntropyMethod(num_candidates=40, num_elites=5, optim_steps=3, p_random=0.5)
     normal, uniform, noise = table(3, cem, 2)
     start = {"mean": torch.tensor([-2.0, 1.0]) + 0.1 * torch.randn(3, 2, 2), "std": 0.3 * torch.rand(3, 2, 2)}
-    together = cem(judge_of(torch.arange(3)), LOW, HIGH, batch=3, horizon=2, noise=noise, **start)
+    options = {"horizon": 2, "max_restarts": 3}
+    together = cem(score_plans_of(torch.arange(3)), LOW, HIGH, batch=3, noise=noise, **options, **start)
     assert together.iterations.tolist() == [3, 5, 4]
     for i in range(3):
         alone = cem(
-            judge_of(torch.tensor([i])),
+            score_plans_of(torch.tensor([i])),
             LOW,
             HIGH,
             batch=1,
-            horizon=2,
             noise=lambda rows, k, i=i: (normal[k, i : i + 1], uniform[k, i : i + 1]),
+            **options,
             **{name: value[i : i + 1] for name, value in start.items()},
         )
         for name in together._fields:
@@ -287,7 +288,7 @@ def test_held_candidates_repeat_their_first_uniform_action_in_the_first_round_al
 
 def test_held_candidates_find_what_must_be_kept_up():
     # Only sequences that go up at nearly full speed at every step score: independent draws hardly ever do.
-    def judge(actions, rows, restarts, iteration):
+    def score_plans(actions, rows, restarts, iteration):
         score = torch.where((actions[..., 0] > 0.8).all(-1), 1.0, 0.0)
         return PlanScores(score, torch.ones_like(score, dtype=torch.bool), score)
 
@@ -297,7 +298,7 @@ def test_held_candidates_find_what_must_be_kept_up():
     for p_constant in (0.0, 0.5):
         torch.manual_seed(0)
         cem = CrossEntropyMethod(p_random=0.5, p_constant=p_constant, **settings)
-        found.append(cem(judge, *box, batch=50, horizon=5).score.mean().item())
+        found.append(cem(score_plans, *box, batch=50, horizon=5).score.mean().item())
     assert found[0] < 0.1
     assert found[1] > 0.9
 
@@ -311,14 +312,14 @@ def test_without_a_start_the_gaussian_covers_the_box():
     torch.testing.assert_close(record.asked[0][0], (middle + quarter * normal[0]).clamp(LOW, HIGH))
 
 
-def test_every_population_is_scored_and_the_result_is_one_of_them():
+def test_every_iteration_is_scored_and_the_result_is_one_of_them():
     torch.manual_seed(0)
     cem = CrossEntropyMethod(num_candidates=30, num_elites=5, optim_steps=4)
     record, drawn = Record(quadratic([-2.0, 1.0])), []
 
     def noise(rows, iteration):
         drawn.append(iteration)
-        return cem.draw(rows, 2, 2)
+        return cem.sample_noise(rows, 2, 2)
 
     result = cem(record, LOW, HIGH, batch=3, horizon=2, noise=noise)
     assert drawn == [asked[3] for asked in record.asked] == [0, 1, 2, 3]
@@ -339,23 +340,71 @@ def test_the_best_of_all_rounds_is_kept_not_of_the_last():
 
     record = Record(ever_worse)
     result = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3)(record, LOW, HIGH, batch=1, horizon=2)
-    actions, *_, judgement = record.asked[0]
-    assert torch.equal(result.actions[0], actions[0, judgement.score[0].argmax()])
-    assert result.score[0] == judgement.score.max()
+    actions, *_, scores = record.asked[0]
+    assert torch.equal(result.actions[0], actions[0, scores.score[0].argmax()])
+    assert result.score[0] == scores.score.max()
 
 
-def test_finished_rows_are_not_judged_any_more():
+def test_finished_rows_are_not_scored_any_more():
     torch.manual_seed(0)
 
-    def judge(actions, rows, restarts, iteration):
+    def score_plans(actions, rows, restarts, iteration):
         score = actions[..., 0].sum(-1)
         return PlanScores(score, ((rows == 0) | (restarts >= 1))[:, None].expand_as(score), score)
 
-    record = Record(judge)
-    cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=2, max_restarts=1)
-    result = cem(record, LOW, HIGH, batch=2, horizon=1)
+    record = Record(score_plans)
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=2, optim_steps=2)
+    result = cem(record, LOW, HIGH, batch=2, horizon=1, max_restarts=1)
     assert [asked[1].tolist() for asked in record.asked] == [[0, 1], [0, 1], [1]]
     assert result.iterations.tolist() == [2, 3]
+
+
+def test_a_negative_number_of_restarts_is_refused():
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=2)
+    with pytest.raises(ValueError, match="max_restarts must be at least 0, got -1"):
+        cem(quadratic([-2.0, 1.0]), LOW, HIGH, batch=1, horizon=1, max_restarts=-1)
+
+
+def test_the_defaults_are_the_papers():
+    cem = CrossEntropyMethod()
+    settings = (cem.num_candidates, cem.num_elites, cem.optim_steps, cem.p_random, cem.p_constant, cem.min_std)
+    assert settings == (1000, 100, 4, 1.0, 0.0, 0.0)  # Table 1; n_cem_iters = 5 scores four
+    assert not cem.uses_warm_start
+
+
+@pytest.mark.parametrize(
+    ("p_random", "p_constant", "uses"), [(1.0, 0.0, False), (0.5, 0.0, True), (0.5, 0.5, False), (0.99, 0.0, False)]
+)
+def test_a_warm_start_is_used_where_a_candidate_is_drawn_from_it(p_random, p_constant, uses):
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=2, p_random=p_random, p_constant=p_constant)
+    assert cem.uses_warm_start is uses
+    record = Record(quadratic([-2.0, 1.0]))
+    noise = table(1, cem, 2)[-1]
+    for start in (-2.9, -1.1):
+        cem(record, LOW, HIGH, batch=1, horizon=2, mean=torch.full((1, 2, 2), start), noise=noise)
+    first = [asked[0] for asked in record.asked if asked[3] == 0]
+    assert torch.equal(*first) is not uses
+
+
+def test_no_rows_need_no_scores():
+    cem = CrossEntropyMethod(num_candidates=10, num_elites=2)
+    result = cem(None, LOW, HIGH, batch=0, horizon=3)
+    assert result.actions.shape == result.mean.shape == result.std.shape == (0, 3, 2)
+    assert result.score.shape == result.fallback.shape == result.iterations.shape == (0,)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_bounds_scores_and_starts_of_any_floating_dtype_are_searched_in_float32(dtype):
+    def score_plans(actions, rows, restarts, iteration):
+        assert actions.dtype == torch.float32
+        score = -(actions + 2).square().sum((-1, -2)).to(dtype)
+        return PlanScores(score, (score > -2.0) & (restarts[:, None] > 0), score)
+
+    cem = CrossEntropyMethod(num_candidates=50, num_elites=5, p_random=0.5)
+    start = torch.full((2, 3, 2), -1.5, dtype=dtype)
+    torch.manual_seed(0)
+    result = cem(score_plans, LOW.to(dtype), HIGH.to(dtype), batch=2, horizon=3, max_restarts=1, mean=start)
+    assert result.actions.dtype == result.mean.dtype == result.score.dtype == torch.float32
 
 
 def test_the_given_start_is_left_as_it_was():
@@ -374,7 +423,6 @@ def test_the_given_start_is_left_as_it_was():
         ({"num_elites": 0}, "num_elites must lie between 1 and num_candidates = 10, got 0"),
         ({"num_elites": 11}, "num_elites must lie between 1 and num_candidates = 10, got 11"),
         ({"optim_steps": 0}, "optim_steps must be at least 1"),
-        ({"max_restarts": -1}, "max_restarts must be at least 0"),
         ({"p_random": 1.1}, r"p_random must lie in \[0, 1\]"),
         ({"p_random": -0.1}, r"p_random must lie in \[0, 1\]"),
         ({"p_constant": -0.1}, r"p_constant must lie in \[0, 1\]"),

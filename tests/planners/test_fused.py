@@ -7,10 +7,10 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.data import Bounded
 
+from ls3_torchrl.layers import fastest_precision
 from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
 from ls3_torchrl.planners import FusedImagination, ImaginationNoise, LatentEnv, RolloutImagination, feasible
 from ls3_torchrl.planners.imagination import Limits
-from ls3_torchrl.planners.layers import fastest_precision
 
 D, A, M = 4, 2, 3
 B, N, H, P = 2, 7, 3, 4
@@ -74,16 +74,16 @@ def test_blocks_are_a_matter_of_speed_only(block):
 
 
 @pytest.mark.parametrize("block", [1024, 10])
-@pytest.mark.parametrize("share", [0.0, 0.7, 1.0])
-def test_with_limits_only_what_is_feasible_is_valued_and_nothing_else_changes(share, block):
+@pytest.mark.parametrize("fraction", [0.0, 0.7, 1.0])
+def test_with_limits_only_what_is_feasible_is_valued_and_nothing_else_changes(fraction, block):
     imagine = fused_of(build(), precision="fp32", block=block)
     whole = imagine(*problem())
     # Half of the plans end safely enough, and none or some or all of those keep to the constraint.
-    constraint_threshold = whole.constraint_prob.amax(-1).quantile(share).item() + (1e-6 if share else -1e-6)
+    constraint_threshold = whole.constraint_prob.amax(-1).quantile(fraction).item() + (1e-6 if fraction else -1e-6)
     limits = Limits(whole.safe_set_prob.median(dim=1, keepdim=True).values, constraint_threshold)
     part = imagine(*problem(), limits)
     allowed = feasible(whole, safe_set_threshold=limits.safe_set_threshold, constraint_threshold=constraint_threshold)
-    assert allowed.any() == (share > 0.0)
+    assert allowed.any() == (fraction > 0.0)
     assert not allowed.all()
     for name in ("constraint_prob", "safe_set_prob"):
         assert torch.equal(getattr(part, name), getattr(whole, name))
@@ -179,7 +179,7 @@ def test_a_snapshot_is_taken_only_when_something_changed():
     assert imagine.refresh() is False
 
 
-def test_within_a_steady_stretch_changes_are_looked_for_once_and_again_after_it():
+def test_with_fixed_parameters_changes_are_looked_for_once_and_again_after_it():
     parts = build()
     imagine = fused_of(parts, precision="fp32")
     looked = []
@@ -192,7 +192,7 @@ def test_within_a_steady_stretch_changes_are_looked_for_once_and_again_after_it(
     with torch.no_grad():
         parts["safe_set"].network[-1].bias += 3.0
     with suppress(RuntimeError), imagine.parameters_fixed():
-        raise RuntimeError("an error in between must not leave it steady")
+        raise RuntimeError("an error in between must not leave them fixed")
     after = imagine(*problem())
     assert looked == [True, True, False]
     assert (after.safe_set_prob > first.safe_set_prob).all()
@@ -262,7 +262,7 @@ def test_auto_settles_on_what_was_measured():
     imagine = fused_of(build(), precision="auto")
     imagine(*problem())
     expected = {"fp32": torch.float32, "bf16": torch.bfloat16}[fastest_precision("cpu")]
-    assert imagine._dtype == expected
+    assert imagine._snapshot.dtype == expected
 
 
 def test_unknown_precision_is_refused():

@@ -6,16 +6,16 @@ from torchrl.data import Bounded
 
 from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
 from ls3_torchrl.planners import FusedImagination, ImaginationNoise, LatentEnv, RolloutImagination
-from ls3_torchrl.planners.imagination import draw_members
+from ls3_torchrl.planners.imagination import sample_imagination_noise
 
 D, A, M = 4, 2, 3
 B, N, H, P = 2, 6, 3, 5
 
 
-def modules(propagation="ts1"):
+def modules(propagation="ts1", num_members=M):
     torch.manual_seed(0)
     env = LatentEnv(
-        EnsembleDynamics(D, A, num_members=M, hidden=(8,), propagation=propagation),
+        EnsembleDynamics(D, A, num_members=num_members, hidden=(8,), propagation=propagation),
         ConstraintEstimator(D, hidden=(8,)),
         GoalEstimator(D, hidden=(8,)),
         action_spec=Bounded(low=-1.0, high=1.0, shape=(A,)),
@@ -24,9 +24,9 @@ def modules(propagation="ts1"):
 
 
 def problem(*, common=True, fixed=False):
+    env, *_ = modules("tsinf" if fixed else "ts1")
     torch.manual_seed(1)
-    members = draw_members(M, H, P, fixed=fixed, device=torch.device("cpu"))
-    noise = ImaginationNoise(members, torch.randn(B, H, P, 1 if common else N, D))
+    noise = sample_imagination_noise(env, B, H, P, 1 if common else N)
     return 2 * torch.randn(B, D), torch.rand(B, N, H, A) * 2 - 1, noise
 
 
@@ -106,7 +106,7 @@ def test_reductions_and_noise_make_a_difference():
     assert not torch.allclose(imagine(latent, actions, noise).value, imagine(latent, actions, other).value, atol=1e-3)
 
 
-def test_under_common_noise_equal_plans_are_judged_equally():
+def test_under_common_noise_equal_plans_are_rated_equally():
     env, value, safe_set = modules()
     latent, actions, noise = problem(common=True)
     same = actions[:, :1].expand(-1, N, -1, -1)
@@ -123,9 +123,15 @@ def test_imagining_leaves_no_gradients_and_draws_nothing():
     assert torch.equal(before, torch.get_rng_state())
 
 
+def sampled_members(num_members, horizon, particles, propagation="ts1"):
+    env, *_ = modules(propagation, num_members)
+    torch.manual_seed(0)
+    return sample_imagination_noise(env, 1, horizon, particles, 1).members
+
+
 def test_members_split_the_particles_evenly_and_anew_at_each_step():
     torch.manual_seed(0)
-    members = draw_members(5, 200, 20, fixed=False, device=torch.device("cpu"))
+    members = sampled_members(5, 200, 20)
     assert members.shape == (200, 20)
     assert all(torch.bincount(step, minlength=5).tolist() == [4] * 5 for step in members)
     # Each particle meets each member: 200 steps, 40 expected, deviation 5.7.
@@ -135,7 +141,7 @@ def test_members_split_the_particles_evenly_and_anew_at_each_step():
 
 def test_an_uneven_split_differs_by_one_and_favours_nobody():
     torch.manual_seed(0)
-    members = draw_members(3, 600, 4, fixed=False, device=torch.device("cpu"))
+    members = sampled_members(3, 600, 4)
     counts = torch.stack([torch.bincount(step, minlength=3) for step in members])
     assert counts.min() == 1
     assert counts.max() == 2
@@ -144,6 +150,6 @@ def test_an_uneven_split_differs_by_one_and_favours_nobody():
 
 
 def test_fixed_members_stay_over_the_horizon():
-    members = draw_members(3, 4, 7, fixed=True, device=torch.device("cpu"))
+    members = sampled_members(3, 4, 7, propagation="tsinf")
     assert members.shape == (4, 7)
     assert (members == members[0]).all()

@@ -1,26 +1,47 @@
-"""One whole smoke run, with pictures, for the tests that look at what it left."""
-
-from pathlib import Path
+"""One whole smoke run, with pictures, for the tests that look at what it left; and a logger that remembers."""
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from torchrl.record.loggers import Logger
 
-import ls3
+from ls3_recipes.configuration import train_settings
+from ls3_recipes.protocol import run_experiment
+
+
+class Recorder(Logger):
+    """A logger that keeps what is logged as (name, value, step)."""
+
+    def __init__(self):
+        self.rows = []
+        super().__init__(exp_name="test", log_dir="")
+
+    def _create_experiment(self):
+        return None
+
+    def log_scalar(self, name, value, step=None):
+        self.rows.append((name, value, step))
+
+    def log_video(self, name, video, step=None, **kwargs):
+        raise NotImplementedError
+
+    def log_hparams(self, cfg):
+        raise NotImplementedError
+
+    def log_histogram(self, name, data, **kwargs):
+        raise NotImplementedError
+
+    def __repr__(self):
+        return "Recorder()"
+
+
+@pytest.fixture
+def recorder():
+    return Recorder()
 
 
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pictures") / "run"
-    with initialize_config_dir(str(Path(ls3.__file__).parent / "conf"), version_base="1.3"):
-        config = compose("ls3", ["preset=smoke", "device=cpu", f"output={folder}"])
     torch.manual_seed(0)
-    ls3.train(config)
+    run_experiment(train_settings("preset=smoke", "device=cpu", f"output={folder}"))
     return folder
-
-
-@pytest.fixture
-def config(request):
-    conf = request.config.rootpath / "recipes" / "conf"
-    with initialize_config_dir(str(conf), version_base="1.3"):
-        return compose("ls3", ["preset=smoke"])

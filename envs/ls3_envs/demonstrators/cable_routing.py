@@ -50,7 +50,7 @@ class CableWanderer(CableDemonstrator):
     Args:
         horizon: steps within which the demonstration is left.
         noise_std: standard deviation of the noise on the demonstration's displacements, in metres.
-        seed: seed of everything that is drawn.
+        seed: seed of everything that is sampled.
     """
 
     def __init__(self, *, horizon: int = 40, noise_std: float = 0.004, seed: int = 0) -> None:

@@ -39,7 +39,7 @@ def _straight_at(state: Tensor, block: Tensor, speed: float) -> Tensor:
 class PushingDemonstrator(Scripted):
     """Guides the hand to one block after another and pushes it to its goal, straight and slowly.
 
-    The blocks' order is drawn for each episode: with always the same one, the hand's place alone would tell how much
+    The blocks' order is sampled for each episode: with always the same one, the hand's place alone would tell how much
     is done, and values learnt from such demonstrations look at the hand and not at the blocks.
 
     Args:
@@ -70,8 +70,9 @@ class PushingDemonstrator(Scripted):
 class PushingViolator(Scripted):
     """Moves towards the blocks, with bursts of uniform actions in between: random and violating data.
 
-    Each stretch between two bursts has a block of its own, drawn at random. Every other one, on average, goes straight
-    at it from wherever the hand is, and hits it from the side, too; the others come from the front and push on and on.
+    Each stretch between two bursts has a block of its own, sampled at random. Every other one, on average, goes
+    straight at it from wherever the hand is, and hits it from the side, too; the others come from the front and push on
+    and on.
 
     Use it with ``SequentialPushingEnv(start="random")``.
 
@@ -79,7 +80,7 @@ class PushingViolator(Scripted):
         burst: probability per step that a burst begins.
         calm: probability per step that it ends.
         noise_std: standard deviation of the noise on the pushes, in metres.
-        seed: seed of everything that is drawn.
+        seed: seed of everything that is sampled.
 
     Example:
         >>> from torchrl.envs import InitTracker, TransformedEnv

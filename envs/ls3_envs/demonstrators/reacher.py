@@ -89,6 +89,6 @@ class ReacherWanderer(Scripted):
 
     def _act(self, state: Tensor, step: Tensor, is_init: Tensor) -> Tensor:
         last = self._for_the_episode("torque", torch.zeros_like(state[:, :2]), is_init)
-        drawn = torch.randn(last.shape, generator=self._generator).to(last) * self.step_std
-        self._kept["torque"] = (last + drawn).clamp(-self.limit, self.limit)
+        change = torch.randn(last.shape, generator=self._generator).to(last) * self.step_std
+        self._kept["torque"] = (last + change).clamp(-self.limit, self.limit)
         return self._kept["torque"]

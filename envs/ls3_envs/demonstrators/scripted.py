@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 
 class Scripted(TensorDictModuleBase):
-    """A policy over ``state`` that counts the steps of each world since its reset (``is_init``).
+    """A policy over ``state`` that counts the steps of each environment since its reset (``is_init``).
 
     Args:
         limit: largest size of an action along each axis.
@@ -36,7 +36,7 @@ class Scripted(TensorDictModuleBase):
         self._kept: dict[str, Tensor] = {}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the noisy action of every world."""
+        """Write the noisy action of every environment."""
         state, is_init = tensordict["state"], tensordict["is_init"]
         if self._step is None or self._step.shape != is_init.shape:
             self._step = torch.zeros_like(is_init, dtype=torch.long)
@@ -48,14 +48,14 @@ class Scripted(TensorDictModuleBase):
 
     @abstractmethod
     def _act(self, state: Tensor, step: Tensor, is_init: Tensor) -> Tensor:
-        """Noiseless actions ``[N, A]`` at the worlds' steps ``[N, 1]``."""
+        """Noiseless actions ``[N, A]`` at the steps ``[N, 1]``."""
 
     def _uniform(self, like: Tensor, size: int, low: float = 0.0, high: float = 1.0) -> Tensor:
         """Uniform numbers ``[N, size]`` from the policy's own stream."""
         return low + (high - low) * torch.rand(len(like), size, generator=self._generator).to(like)
 
     def _for_the_episode(self, name: str, fresh: Tensor, is_init: Tensor) -> Tensor:
-        """What was drawn at the episode's first step, ``[N, size]``."""
+        """What was sampled at the episode's first step, ``[N, size]``."""
         kept = self._kept.get(name)
         kept = fresh if kept is None or kept.shape != fresh.shape else torch.where(is_init, fresh, kept)
         self._kept[name] = kept
@@ -63,7 +63,7 @@ class Scripted(TensorDictModuleBase):
 
 
 def collect_episodes(env: EnvBase, policy: TensorDictModuleBase) -> TensorDictBase:
-    """One whole episode in every world: a tensordict ``[N, T]`` with the standard keys.
+    """One whole episode in every environment: a tensordict ``[N, T]`` with the standard keys.
 
     Args:
         env: a batched environment whose resets are marked by an ``InitTracker``.

@@ -24,13 +24,13 @@ _ABSURD_SPEED = 1e4
 
 
 class MujocoEnv(VisualConstraintEnv):
-    """N worlds of one MuJoCo model, each a row of positions and velocities in float64.
+    """N copies of one MuJoCo model, each a row of positions and velocities in float64.
 
-    What the state is after a step depends on the world's own state, action and random stream alone. With C MuJoCo
+    What the state is after a step depends on its own state, action and random stream alone. With C MuJoCo
     and either renderer, the same seed gives the same bits whatever ``num_envs`` and ``threads`` are; MuJoCo Warp
     computes in float32 and follows it closely.
 
-    A world whose physics blows up goes back to its last good state, ends its episode (``truncated``) and says so under
+    One whose physics blows up goes back to its last good state, ends its episode (``truncated``) and says so under
     ``physics_error``, bool ``[N, 1]``; the others do not notice.
 
     Args:
@@ -44,9 +44,9 @@ class MujocoEnv(VisualConstraintEnv):
         image_size: side of the image in pixels.
         physics: ``"mujoco"``, or ``"warp"`` for a GPU.
         renderer: ``"raytrace"``, or ``"egl"``.
-        threads: that C MuJoCo shares the worlds between; the machine's cores when ``None``.
+        threads: that C MuJoCo shares them between; the machine's cores when ``None``.
         device: of states and pictures.
-        seed: of the worlds' random streams.
+        seed: of the environments' random streams.
 
     Raises:
         ValueError: for an unknown back end, renderer, camera or image size, and as the base class does.
@@ -102,7 +102,7 @@ class MujocoEnv(VisualConstraintEnv):
         return torch.where(sound, moved, state)
 
     def _view(self, state: Tensor) -> View:
-        """Picture and geoms of states; what was drawn last is kept, since several questions are asked of a state."""
+        """Picture and geoms of states; what was rendered last is kept, since several questions are asked of a state."""
         if self._seen is None or not torch.equal(self._seen[0], state):
             self._seen = (state.clone(), self.renderer(state[:, : self.model.nq]))
         return self._seen[1]

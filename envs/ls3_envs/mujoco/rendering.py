@@ -26,7 +26,7 @@ class View(NamedTuple):
 
 
 class Renderer(Protocol):
-    """Draws any poses; what a world looks like depends on its own pose alone."""
+    """Renders any poses; what a world looks like depends on its own pose alone."""
 
     def __call__(self, qpos: Tensor) -> View:
         """The view of poses ``[n, nq]``."""
@@ -52,8 +52,8 @@ class RayTracer:
         model: compiled.
         camera: name of the camera.
         size: side of the image in pixels, 8 to 1024.
-        num_envs: worlds drawn in one call; other numbers are drawn in several.
-        device: of PyTorch, whose counterpart Warp draws on.
+        num_envs: worlds rendered in one call; other numbers are rendered in several.
+        device: of PyTorch, whose counterpart Warp renders on.
         groups: geom groups that are seen.
     """
 
@@ -96,13 +96,13 @@ class RayTracer:
         """The view of poses ``[n, nq]``."""
         n, worlds = len(qpos), self.num_envs
         if n == worlds:
-            return self._draw(qpos)
+            return self._render(qpos)
         missing = -n % worlds
         padded = torch.cat([qpos, qpos[-1:].expand(missing, -1)])
-        views = [self._draw(part) for part in padded.split(worlds)]
+        views = [self._render(part) for part in padded.split(worlds)]
         return View(*(torch.cat(parts)[:n] for parts in zip(*views, strict=True)))
 
-    def _draw(self, qpos: Tensor) -> View:
+    def _render(self, qpos: Tensor) -> View:
         wp, mjw = self._wp, self._mjw
         with wp.ScopedDevice(self._device):
             wp.to_torch(self._data.qpos).copy_(qpos)
@@ -152,11 +152,11 @@ class EGLRenderer:
 
     def __call__(self, qpos: Tensor) -> View:
         """The view of poses ``[n, nq]``."""
-        views = [self._draw(pose) for pose in qpos.double().cpu().numpy()]
+        views = [self._render(pose) for pose in qpos.double().cpu().numpy()]
         pixels, geoms = (torch.from_numpy(np.stack(parts)).to(qpos.device) for parts in zip(*views, strict=True))
         return View(pixels.permute(0, 3, 1, 2).contiguous(), geoms.long())
 
-    def _draw(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _render(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         renderer = self._renderer
         self._data.qpos[:] = pose
         mujoco.mj_forward(self._model, self._data)

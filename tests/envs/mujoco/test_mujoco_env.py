@@ -112,5 +112,5 @@ def test_stepping_before_the_first_reset_is_refused():
 def test_actions_of_another_shape_are_refused():
     env = ReacherEnv(num_envs=2, seed=0)
     td = env.reset()
-    with pytest.raises(ValueError, match=r"shape \[2, 2\], one row for each world; got \[2, 3\]"):
+    with pytest.raises(ValueError, match=r"shape \[2, 2\], one row for each environment; got \[2, 3\]"):
         env.step(td.set("action", torch.zeros(2, 3)))

@@ -1,0 +1,100 @@
+"""Copies of ReLU networks' layers, run in the precision that is fastest here."""
+
+from __future__ import annotations
+
+import time
+from functools import lru_cache
+from typing import Literal, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import linear
+from torchrl.modules import MLP
+
+from ls3_torchrl.modules.ensemble import EnsembleMLP
+
+Precision = Literal["auto", "fp32", "bf16"]
+#: A network's layers: weight ``[out, in]`` and bias ``[out]``, ReLU between them.
+Layers = list[tuple[Tensor, Tensor]]
+
+
+def is_relu_mlp(network: nn.Module) -> bool:
+    """Whether a network is linear layers with ReLU between them, and nothing else.
+
+    Types are compared exactly: a subclass of a linear layer, such as a noisy or a parametrised one, computes something
+    else than its weight and bias say.
+    """
+    if type(network) not in (nn.Sequential, MLP):
+        return False
+    layers = list(cast(nn.Sequential, network))
+    return len(layers) % 2 == 1 and all(
+        type(layer) is (nn.Linear if i % 2 == 0 else nn.ReLU) and getattr(layer, "bias", 0) is not None
+        for i, layer in enumerate(layers)
+    )
+
+
+def layers_of(network: nn.Module, dtype: torch.dtype) -> Layers:
+    """Copies of a plain network's layers."""
+    assert isinstance(network, nn.Sequential)
+    return [
+        (layer.weight.detach().to(dtype).clone(), layer.bias.detach().to(dtype).clone())
+        for layer in network
+        if isinstance(layer, nn.Linear)
+    ]
+
+
+def members_of(network: EnsembleMLP, dtype: torch.dtype) -> list[Layers]:
+    """Copies of an ensemble's layers, one member after another."""
+    return [
+        [
+            (weight[m].detach().T.to(dtype, copy=True).contiguous(), bias[m, 0].detach().to(dtype).clone())
+            for weight, bias in zip(network.weights, network.biases, strict=True)
+        ]
+        for m in range(network.num_members)
+    ]
+
+
+@lru_cache(maxsize=1)
+def _has_fused_linear() -> bool:
+    """Whether PyTorch's private fused bf16 layer is there and right on this machine."""
+    x, w, b = (torch.ones(shape, dtype=torch.bfloat16) for shape in ((2, 4), (3, 4), (3,)))
+    try:
+        out = torch.ops.mkldnn._linear_pointwise(x, w, b, "relu", [], "")
+    except (AttributeError, RuntimeError, NotImplementedError):
+        return False
+    return bool((out == 5).all())
+
+
+def run_layers(x: Tensor, layers: Layers) -> Tensor:
+    """A ReLU network on rows ``[R, in]``, in the layers' own precision."""
+    last = len(layers) - 1
+    if x.dtype == torch.bfloat16 and x.device.type == "cpu" and _has_fused_linear():
+        for i, (weight, bias) in enumerate(layers):
+            x = torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu" if i < last else "none", [], "")
+        return x
+    for i, (weight, bias) in enumerate(layers):
+        x = linear(x, weight, bias)
+        if i < last:
+            x = x.relu_()
+    return x
+
+
+@lru_cache(maxsize=4)
+def fastest_precision(device_type: str) -> Literal["fp32", "bf16"]:
+    """Choose by measuring a layer of the heads' size; CUDA takes bf16, other devices what is clearly faster."""
+    if device_type != "cpu":
+        return "bf16" if device_type == "cuda" and torch.cuda.is_bf16_supported() else "fp32"
+    seconds = {}
+    # From a stream of its own: what is measured once a process must not move the numbers that training draws.
+    own = torch.Generator().manual_seed(0)
+    for dtype in (torch.float32, torch.bfloat16):
+        x, weight, bias = (torch.randn(size, generator=own).to(dtype) for size in ((2048, 256), (256, 256), (256,)))
+        layers = [(weight, bias)] * 3
+        run_layers(x, layers)
+        times = []
+        for _ in range(5):
+            start = time.perf_counter()
+            run_layers(x, layers)
+            times.append(time.perf_counter() - start)
+        seconds[dtype] = min(times)
+    return "bf16" if seconds[torch.bfloat16] < 0.67 * seconds[torch.float32] else "fp32"

@@ -1,0 +1,76 @@
+"""Which way plans are imagined: fast where no module is bypassed, through the environment where one would be."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from tensordict.nn import TensorDictModuleBase
+
+from ls3_torchrl._checks import require_choice
+from ls3_torchrl.layers import Precision
+from ls3_torchrl.planners.fusable import require_fusable, why_not_fused
+from ls3_torchrl.planners.fused import FusedImagination
+from ls3_torchrl.planners.imagination import Imagination, RolloutImagination
+from ls3_torchrl.planners.latent_env import LatentEnv
+from ls3_torchrl.planners.scoring import ConstraintReduction, SafeSetReduction
+
+EngineName = Literal["auto", "fused", "rollout"]
+
+
+class Engine:
+    """Chooses between :class:`FusedImagination` and :class:`RolloutImagination`, anew at each request.
+
+    Modules may be exchanged, or hooked, between two plans.
+
+    Args:
+        env: the learned model.
+        value: V.
+        safe_set: f_S.
+        name: ``"fused"``, ``"rollout"``, or ``"auto"`` for the first wherever it bypasses no module.
+        precision: of the fused one.
+        constraint_reduction: over particles, ``"max"`` or ``"mean"``.
+        safe_set_reduction: over particles, ``"mean"`` or ``"min"``.
+
+    Raises:
+        ValueError: for an unknown choice.
+        TypeError: for modules that ``"fused"`` would bypass.
+    """
+
+    def __init__(
+        self,
+        env: LatentEnv,
+        value: TensorDictModuleBase,
+        safe_set: TensorDictModuleBase,
+        name: EngineName = "auto",
+        *,
+        precision: Precision = "auto",
+        constraint_reduction: ConstraintReduction = "max",
+        safe_set_reduction: SafeSetReduction = "mean",
+    ) -> None:
+        require_choice(name, ("auto", "fused", "rollout"), "engine")
+        require_choice(precision, ("auto", "fp32", "bf16"), "precision")
+        require_choice(constraint_reduction, ("max", "mean"), "constraint_reduction")
+        require_choice(safe_set_reduction, ("mean", "min"), "safe_set_reduction")
+        self.name: EngineName = name
+        self._modules = env, value, safe_set
+        self._precision: Precision = precision
+        self._reductions: dict[str, Any] = {
+            "constraint_reduction": constraint_reduction,
+            "safe_set_reduction": safe_set_reduction,
+        }
+        self._rollout = RolloutImagination(*self._modules, **self._reductions)
+        self._fused: FusedImagination | None = None
+        if name == "fused":
+            require_fusable(*self._modules)
+
+    def choose(self) -> Imagination:
+        """What imagines plans now."""
+        if self.name == "rollout":
+            return self._rollout
+        if self.name == "fused":
+            require_fusable(*self._modules)
+        elif why_not_fused(*self._modules) is not None:
+            return self._rollout
+        if self._fused is None:
+            self._fused = FusedImagination(*self._modules, precision=self._precision, **self._reductions)
+        return self._fused

@@ -1,0 +1,82 @@
+"""Copies of the networks' layers, taken anew when a parameter changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, cast
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from ls3_torchrl.layers import Layers, Precision, fastest_precision, layers_of, members_of
+from ls3_torchrl.planners.latent_env import LatentEnv
+
+
+class Snapshot:
+    """Copies of the layers of five networks, made anew whenever a parameter has changed.
+
+    Args:
+        env: holds dynamics, constraint and goal estimator.
+        value: V.
+        safe_set: f_S.
+        precision: ``"fp32"``, ``"bf16"``, or ``"auto"`` for what a short measurement finds faster here.
+
+    Attributes:
+        dtype: of the layers.
+        members: the dynamics, one member after another.
+        stacked: the dynamics in weights ``[M, in, out]`` and biases ``[M, 1, out]``.
+        value: V, one member after another.
+        heads: constraint, goal and safe set.
+    """
+
+    def __init__(
+        self, env: LatentEnv, value: TensorDictModuleBase, safe_set: TensorDictModuleBase, precision: Precision
+    ) -> None:
+        self._env, self._value, self._safe_set, self._precision = env, value, safe_set, precision
+        self._forget()
+
+    def _forget(self) -> None:
+        self.dtype = torch.float32
+        self.members: list[Layers] = []
+        self.stacked: Layers = []
+        self.value: list[Layers] = []
+        self.heads: dict[str, Layers] = {}
+        self._seen: list[Tensor] = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The networks, without the copies: those are made anew where they are needed."""
+        empty = Snapshot(self._env, self._value, self._safe_set, self._precision)
+        return dict(vars(empty))
+
+    @property
+    def _heads(self) -> dict[str, nn.Module]:
+        return {"constraint": self._env.constraint, "goal": self._env.goal, "safe_set": self._safe_set}
+
+    def _parameters(self) -> Iterable[nn.Parameter]:
+        for module in (self._env.dynamics, self._env.constraint, self._env.goal, self._value, self._safe_set):
+            yield from module.parameters()
+
+    def refresh(self) -> bool:
+        """Copy the layers anew if a parameter changed; return whether it had."""
+        # Values are compared: fused optimisers change parameters without raising their version counter.
+        parameters = list(self._parameters())
+        if len(parameters) == len(self._seen) and all(map(_same, parameters, self._seen)):
+            return False
+        device = parameters[0].device
+        chosen = fastest_precision(device.type) if self._precision == "auto" else self._precision
+        self.dtype = torch.bfloat16 if chosen == "bf16" else torch.float32
+        dynamics = self._env.dynamics.network
+        self.members = members_of(dynamics, self.dtype)
+        self.stacked = [
+            (weight.detach().to(self.dtype).clone(), bias.detach().to(self.dtype).clone())
+            for weight, bias in zip(dynamics.weights, dynamics.biases, strict=True)
+        ]
+        self.value = members_of(self._value.network, self.dtype)
+        self.heads = {name: layers_of(cast(nn.Module, head.network), self.dtype) for name, head in self._heads.items()}
+        self._seen = [p.detach().clone() for p in parameters]
+        return True
+
+
+def _same(one: Tensor, other: Tensor) -> bool:
+    return (one.device, one.dtype) == (other.device, other.dtype) and torch.equal(one, other)

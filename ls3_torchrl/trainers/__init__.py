@@ -1,0 +1,28 @@
+"""Training as components, on any environment: the VAE, the latent models, and what they know."""
+
+from ls3_torchrl.trainers.diagnostics import StateProbe
+from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner
+from ls3_torchrl.trainers.ls3 import LS3Trainer
+from ls3_torchrl.trainers.options import (
+    LossOptions,
+    LS3Options,
+    OfflineOptions,
+    OnlineOptions,
+    OptimOptions,
+    VAEOptions,
+)
+from ls3_torchrl.trainers.vae import VAETrainer
+
+__all__ = [
+    "AuxiliaryLoss",
+    "LS3Options",
+    "LS3Trainer",
+    "Learner",
+    "LossOptions",
+    "OfflineOptions",
+    "OnlineOptions",
+    "OptimOptions",
+    "StateProbe",
+    "VAEOptions",
+    "VAETrainer",
+]

@@ -1,0 +1,231 @@
+"""LS3Trainer: the latent models are trained offline, then updated as episodes come (section 1.1.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.record.loggers import Logger
+
+from ls3_torchrl.agent import LS3Agent
+from ls3_torchrl.data import VALUE_TAGS, RowSelection, Tag, TaggedReplayBuffer
+from ls3_torchrl.objectives import (
+    ClassifierLoss,
+    EnsembleDynamicsLoss,
+    OfflineValueLoss,
+    SafeSetLoss,
+    TD1ValueLoss,
+)
+from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner, wants_bf16
+from ls3_torchrl.trainers.options import LS3Options
+
+#: The learners in the order in which they are trained.
+LEARNERS = ("dynamics", "value", "value_td", "safe_set", "constraint", "goal")
+
+
+class LS3Trainer:
+    """All learners of an agent on one buffer, in the paper's order: equations (2), (3), (4), (5), constraint and goal.
+
+    Args:
+        agent: its networks are trained in place.
+        buffer: filled with the offline data and encoded (:class:`~ls3_torchrl.trainers.VAETrainer`, or
+            ``buffer.encode``); its γ is that of equations (3) and (4).
+        options: how.
+        episode_length: T, steps of an episode, of which the value of failure is made; the longest in the buffer when
+            ``None``.
+        logger: one of TorchRL's; gets every metric as ``phase/name``.
+        progress: show progress bars.
+
+    Raises:
+        ValueError: for options that do not fit the buffer's.
+        FloatingPointError: by training, when a loss is not finite.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictModule
+        >>> from ls3_torchrl.trainers import OfflineOptions, OptimOptions
+        >>> encoder = TensorDictModule(torch.nn.Identity(), ["pixels"], ["latent"])  # states are latents already
+        >>> agent = LS3Agent(action_dim=2, encoder=encoder, latent_dim=4)
+        >>> step = {"reward": -torch.ones(9, 1), "pixels": torch.randn(9, 4)}
+        >>> step |= {k: torch.ones(9, 1, dtype=torch.bool) for k in ("constraint", "success")}
+        >>> episode = TensorDict({"pixels": torch.randn(9, 4), "action": torch.zeros(9, 2), "next": step}, [9])
+        >>> buffer = TaggedReplayBuffer(capacity=100, latent_dim=4)
+        >>> buffer.add(episode, "success")
+        >>> buffer.encode(agent.encoder)
+        >>> options = LS3Options(offline=OfflineOptions(2, 2, 2, 2), optim=OptimOptions(batch_size=8))
+        >>> trainer = LS3Trainer(agent, buffer, options, progress=False)
+        >>> trainer.train_offline()
+        >>> trainer.dynamics.steps
+        2
+    """
+
+    def __init__(
+        self,
+        agent: LS3Agent,
+        buffer: TaggedReplayBuffer,
+        options: LS3Options | None = None,
+        *,
+        episode_length: int | None = None,
+        logger: Logger | None = None,
+        progress: bool = True,
+    ) -> None:
+        self.agent, self.buffer = agent, buffer
+        self.options = options = LS3Options() if options is None else options
+        self.episode_length = episode_length
+        if options.loss.monte_carlo and not buffer.continue_failures:
+            raise ValueError(
+                "loss.monte_carlo needs a buffer with continue_failures=True: otherwise a failure's return ends with "
+                "the episode and is no lower bound."
+            )
+        optim = options.optim
+        self._how: dict[str, Any] = {
+            "bf16": wants_bf16(optim.autocast, next(agent.parameters()).device),
+            "cooldown": optim.cooldown,
+            "logger": logger,
+            "progress": progress,
+        }
+        self.dynamics = self._dynamics_learner()
+        self.value, self.value_td = self._value_learner(), self._value_td_learner()
+        self.safe_set = self._safe_set_learner()
+        self.constraint = self._classifier_learner("constraint", buffer.keys.constraint)
+        self.goal = self._classifier_learner("goal", buffer.keys.success)
+        for name in options.loss.mean_latents:
+            keys = {"latent": "loc", "next_latent": ("next", "loc")}
+            self.learners[name].loss.set_keys(**(keys if name == "dynamics" else {"latent": ("next", "loc")}))
+
+    @property
+    def learners(self) -> dict[str, Learner]:
+        """The learners by name, in the order in which they are trained."""
+        return {name: getattr(self, name) for name in LEARNERS}
+
+    def _members(self, module: TensorDictModuleBase) -> int | None:
+        """Members of an ensemble that each learn from a batch of their own; ``None`` where all learn from the same."""
+        return getattr(module, "num_members", None) if self.options.optim.bootstrap else None
+
+    def _sampler(self, members: int | None = None, **rows: Any) -> Callable[[], TensorDictBase]:
+        """Draws batches from the ``rows`` that a :class:`~ls3_torchrl.data.RowSelection` describes."""
+        batch_size = self.options.optim.batch_size
+        selection = RowSelection(online_fraction=self.options.online.fraction, **rows)
+        return lambda: self.buffer.sample(batch_size, selection, members=members)
+
+    def _dynamics_learner(self) -> Learner:
+        """Equation (2)."""
+        options, dynamics = self.options, self.agent.dynamics
+        horizon = options.loss.dynamics_horizon
+        members = self._members(dynamics)
+        loss = EnsembleDynamicsLoss(dynamics, bootstrap=members is not None, steps=horizon)
+        loss.set_keys(action=self.buffer.keys.action)
+        without = None if self.buffer.dynamics_after_violation else "after_violation"
+        sample = self._sampler(members, without=without, steps=horizon if horizon > 1 else None)
+        return Learner("dynamics", loss, sample, lr=options.optim.dynamics_lr, **self._how)
+
+    def _value_learner(self) -> Learner:
+        """Equation (3), with the value of failure beside it where it is asked for."""
+        options, value = self.options, self.agent.value
+        members = self._members(value)
+        bootstrap = members is not None
+        auxiliary = None
+        if options.loss.failure_weight > 0.0:
+            auxiliary = AuxiliaryLoss(
+                options.loss.failure_weight, OfflineValueLoss(value, bootstrap=bootstrap), self._sample_failures
+            )
+        loss = OfflineValueLoss(value, bootstrap=bootstrap)
+        sample = self._sampler(members, tags=VALUE_TAGS)
+        return Learner("value", loss, sample, lr=options.optim.lr, auxiliary=auxiliary, **self._how)
+
+    def _value_td_learner(self) -> Learner:
+        """Equation (4)."""
+        options, value = self.options, self.agent.value
+        members = self._members(value)
+        loss = TD1ValueLoss(
+            value,
+            gamma=self.buffer.gamma,
+            zero_at_goal=options.loss.zero_at_goal,
+            monte_carlo=options.loss.monte_carlo,
+            bootstrap=members is not None,
+        )
+        loss.set_keys(reward=self.buffer.keys.reward)
+        sample = self._sampler(members, tags=VALUE_TAGS)
+        interval = options.optim.target_interval
+        return Learner("value", loss, sample, lr=options.optim.lr, target_interval=interval, **self._how)
+
+    def _safe_set_learner(self) -> Learner:
+        """Equation (5)."""
+        options, sample = self.options, self._sampler()
+        loss = SafeSetLoss(self.agent.safe_set, gamma=options.loss.gamma_safe_set)
+        return Learner(
+            "safe_set",
+            loss,
+            lambda: self._weigh(sample()),
+            lr=options.optim.lr,
+            target_interval=options.optim.target_interval,
+            **self._how,
+        )
+
+    def _classifier_learner(self, name: str, label: NestedKey) -> Learner:
+        loss = ClassifierLoss(getattr(self.agent, name), name=name)
+        loss.set_keys(label=label)  # under the buffer's keys, which need not be the classifier's
+        return Learner(name, loss, self._sampler(), lr=self.options.optim.lr, **self._how)
+
+    def _failure_value(self) -> float:
+        """What failing for a whole episode returns, −(1 − γ^T) / (1 − γ), unless another value was asked for."""
+        value, gamma = self.options.loss.failure_value, self.buffer.gamma
+        if value is not None:
+            return value
+        steps = self.episode_length or int(self.buffer.transitions.storage[:]["steps_left"].max())
+        return -(1.0 - gamma**steps) / (1.0 - gamma) if gamma < 1.0 else -float(steps)
+
+    def _sample_failures(self) -> TensorDictBase:
+        """States of the violating demonstrations, labelled with the value of failure."""
+        optim = self.options.optim
+        members = self._members(self.agent.value)
+        count = max(optim.batch_size // 4, 1) * (members or 1)
+        rows = self.buffer.sample(count, tags=[Tag.CONSTRAINT])
+        if self.options.loss.failure_rows == "violating":
+            found = rows[self.buffer.keys.constraint].flatten().nonzero().flatten()
+            if len(found):
+                # Those that were found stand in for the others: the batch keeps its size.
+                rows = rows[found[torch.arange(count, device=found.device) % len(found)]]
+                rows.set("latent", rows["next", "latent"])
+        rows = rows if members is None else rows.reshape(-1, members)
+        return rows.set("reward_to_go", torch.full_like(rows["reward_to_go"], self._failure_value()))
+
+    def _weigh(self, rows: TensorDictBase) -> TensorDictBase:
+        """The rows for equation (5); how much online episodes that timed out count is an option."""
+        weight = self.options.loss.timed_out_weight
+        if weight != 1.0:
+            timed_out = rows["timed_out"] & (rows["tag"] == int(Tag.ONLINE))
+            rows.set("safe_set_weight", torch.where(timed_out, weight, 1.0))
+        return rows
+
+    def train_offline(self) -> None:
+        """Train the latent models on the offline data (equations (2), (3), (4), (5) and the classifiers)."""
+        steps = self.options.offline
+        self.dynamics.train(steps.dynamics_steps, "Dynamics")
+        self.value.train(steps.value_steps, "Value, reward-to-go")
+        self.value_td.train(steps.value_td_steps, "Value, TD-1")
+        self._train_classifiers(steps.classifier_steps)
+
+    def update(self) -> None:
+        """One update on all data, after new episodes."""
+        steps = self.options.online
+        self.dynamics.train(steps.dynamics_steps, "Dynamics")
+        self.value_td.train(steps.value_td_steps, "Value, TD-1")
+        self._train_classifiers(steps.classifier_steps)
+
+    def _train_classifiers(self, steps: int) -> None:
+        self.safe_set.train(steps, "Safe set")
+        self.constraint.train(steps, "Constraint")
+        self.goal.train(steps, "Goal")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, lagged networks, optimisers and counters of every learner."""
+        return {name: learner.state_dict() for name, learner in self.learners.items()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue where :meth:`state_dict` was taken."""
+        for name, learner in self.learners.items():
+            learner.load_state_dict(state_dict[name])

@@ -1,0 +1,245 @@
+"""The settings of training, each defined, documented and checked here; the defaults are the paper's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from ls3_torchrl._checks import require_at_least, require_choice, require_fraction, require_positive
+
+Autocast = bool | Literal["auto"]
+#: What can learn from the posteriors' means instead of samples.
+MEAN_LATENTS = ("dynamics", "constraint", "goal")
+
+
+def _require_not_negative(value: float, name: str) -> None:
+    if not value >= 0.0:
+        raise ValueError(f"{name} must not be negative, got {value}.")
+
+
+def _require_autocast(value: Autocast) -> None:
+    if value not in (True, False, "auto"):
+        raise ValueError(f"autocast must be true, false or 'auto', got {value!r}.")
+
+
+def _require_rising(value: Sequence[float] | None, name: str, meaning: str, low: float) -> tuple[float, float] | None:
+    """A pair within [0, 1] as a tuple; its first number lies above ``low`` or, for ``low`` below 0, may be 0."""
+    if value is None:
+        return None
+    pair = tuple(float(bound) for bound in value)
+    if len(pair) != 2 or not low < pair[0] <= pair[1] <= 1.0 or (low < 0.0 and not 0.0 <= pair[0] < pair[1]):
+        raise ValueError(f"{name} must be null or {meaning}, got {list(value)}.")
+    return pair
+
+
+@dataclass(frozen=True)
+class VAEOptions:
+    """How encoder and decoder are trained (equation (1), section 1.1.1).
+
+    Args:
+        checkpoint: file of a trained agent whose encoder and decoder are taken, frozen; nothing is trained then.
+        steps: gradient steps, at least 1.
+        batch_size: images in a step, at least 1.
+        lr: Adam's learning rate, above 0; the peak of a one-cycle schedule.
+        schedule: of the learning rate, ``"constant"`` or ``"onecycle"``: it rises for a tenth of the steps, then falls.
+        beta: β, at least 0 (Table 1: 1e-6).
+        warmup: fractions [start, end] of the steps between which β and ``prediction_weight`` rise from 0; ``None``
+            for none. With few latents and a large β a small moving object is otherwise never drawn.
+        reduction: ``"mean"`` or ``"sum"`` over pixels and latent dimensions; see
+            :class:`~ls3_torchrl.objectives.VAELoss`.
+        prediction_weight: weight, at least 0, of :class:`~ls3_torchrl.objectives.LatentPredictionLoss`: dynamics that
+            are trained along must predict the next latent. 0 is the paper.
+        prediction_horizon: steps from the image that is predicted from to the one that is predicted, at least 1.
+        unit_scale: measure the trained latents in units of their own spread.
+        crop_scale: range [low, high] within (0, 1] of the area that random resized crops of the input keep; ``None``
+            for no crops.
+        enlarge_to: images of a dataset enlarged by random shifts and perspectives, from which batches seem drawn
+            (section 1.3.4); ``None`` for the images as they are.
+        autocast: bf16 autocast; ``"auto"`` where a short measurement finds it faster.
+        threads: cores to compute on; all when ``None``.
+
+    Raises:
+        ValueError: naming the field, what was received and what is allowed.
+
+    Example:
+        >>> VAEOptions(steps=2000, batch_size=64, lr=1e-3, schedule="onecycle").beta
+        1e-06
+    """
+
+    checkpoint: str | None = None
+    steps: int = 100_000
+    batch_size: int = 256
+    lr: float = 1e-4
+    schedule: Literal["constant", "onecycle"] = "constant"
+    beta: float = 1e-6
+    warmup: tuple[float, float] | None = None
+    reduction: Literal["mean", "sum"] = "mean"
+    prediction_weight: float = 0.0
+    prediction_horizon: int = 1
+    unit_scale: bool = False
+    crop_scale: tuple[float, float] | None = (0.8, 1.0)
+    enlarge_to: int | None = None
+    autocast: Autocast = "auto"
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.checkpoint is not None and not Path(self.checkpoint).is_file():
+            raise ValueError(
+                f"checkpoint must be null or the file of a trained agent; there is none at {self.checkpoint}."
+            )
+        for name in ("steps", "batch_size", "prediction_horizon"):
+            require_at_least(getattr(self, name), 1, name)
+        for name in ("enlarge_to", "threads"):
+            if getattr(self, name) is not None:
+                require_at_least(getattr(self, name), 1, name)
+        require_positive(self.lr, "lr")
+        require_choice(self.schedule, ("constant", "onecycle"), "schedule")
+        require_choice(self.reduction, ("mean", "sum"), "reduction")
+        _require_not_negative(self.beta, "beta")
+        _require_not_negative(self.prediction_weight, "prediction_weight")
+        _require_autocast(self.autocast)
+        rising = "rising fractions of the steps [start, end]"
+        object.__setattr__(self, "warmup", _require_rising(self.warmup, "warmup", rising, low=-1.0))
+        within = "[low, high] within (0, 1]"
+        object.__setattr__(self, "crop_scale", _require_rising(self.crop_scale, "crop_scale", within, low=0.0))
+
+
+@dataclass(frozen=True)
+class OfflineOptions:
+    """Gradient steps on the offline data, before the first online episode; each at least 0.
+
+    Args:
+        dynamics_steps: of equation (2).
+        value_steps: of equation (3), on the returns that were seen.
+        value_td_steps: of equation (4).
+        classifier_steps: of each of safe set (equation (5)), constraint and goal.
+    """
+
+    dynamics_steps: int = 10_000
+    classifier_steps: int = 10_000
+    value_steps: int = 10_000
+    value_td_steps: int = 10_000
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            require_at_least(value, 0, name)
+
+
+@dataclass(frozen=True)
+class OnlineOptions:
+    """Gradient steps of one update on all data, after new episodes; each at least 0.
+
+    Args:
+        dynamics_steps: of equation (2).
+        classifier_steps: of each of safe set (equation (5)), constraint and goal.
+        value_td_steps: of equation (4).
+        fraction: least fraction of online transitions in a batch, in [0, 1): offline data of hundreds of episodes
+            outnumber the new ones. 0 is the paper.
+    """
+
+    dynamics_steps: int = 512
+    classifier_steps: int = 512
+    value_td_steps: int = 2000
+    fraction: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("dynamics_steps", "classifier_steps", "value_td_steps"):
+            require_at_least(getattr(self, name), 0, name)
+        if not 0.0 <= self.fraction < 1.0:
+            raise ValueError(f"fraction must lie in [0, 1), got {self.fraction}.")
+
+
+@dataclass(frozen=True)
+class OptimOptions:
+    """How the latent models are optimised, all with Adam (section 1.2).
+
+    Args:
+        batch_size: transitions in a step, at least 1 (Table 1: 256).
+        lr: learning rate of all but the dynamics, above 0.
+        dynamics_lr: learning rate of the dynamics, above 0.
+        target_interval: gradient steps between copies to the lagged networks of equations (4) and (5), at least 1.
+        autocast: bf16 autocast; ``"auto"`` where a short measurement finds it faster.
+        cooldown: fraction of every phase's steps, at its end, over which the learning rate falls linearly to 0.
+        bootstrap: a batch of its own for each member of an ensemble, as in Chua et al.; otherwise all see the same.
+    """
+
+    batch_size: int = 256
+    lr: float = 1e-4
+    dynamics_lr: float = 1e-3
+    target_interval: int = 100
+    autocast: Autocast = "auto"
+    cooldown: float = 0.0
+    bootstrap: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("batch_size", "target_interval"):
+            require_at_least(getattr(self, name), 1, name)
+        for name in ("lr", "dynamics_lr"):
+            require_positive(getattr(self, name), name)
+        _require_autocast(self.autocast)
+        require_fraction(self.cooldown, "cooldown")
+
+
+@dataclass(frozen=True)
+class LossOptions:
+    """What the losses of the latent models are; the discount γ is the replay buffer's.
+
+    Args:
+        gamma_safe_set: γ_S in [0, 1] (Table 1).
+        zero_at_goal: the target of equation (4) is 0 where the reward is 0, as in the authors' code.
+        monte_carlo: targets of equation (4) are at least the return that was seen
+            (:class:`~ls3_torchrl.objectives.TD1ValueLoss`); needs a buffer with ``continue_failures``.
+        failure_weight: weight, at least 0, of a term added to equation (3) that pulls the values of the violating
+            demonstrations to ``failure_value``. 0 is the paper.
+        failure_rows: whose values: ``"all"`` states of the violating demonstrations, or those that are ``"violating"``.
+        failure_value: ``None`` for that of an episode without success, −(1 − γ^T) / (1 − γ).
+        mean_latents: which of ``"dynamics"``, ``"constraint"`` and ``"goal"`` learn from the posteriors' means instead
+            of samples.
+        dynamics_horizon: steps over which equation (2) carries each prediction on, at least 1 (the paper: 1).
+        timed_out_weight: weight, at least 0, in equation (5) of online episodes that neither succeeded nor violated;
+            1 is the paper.
+    """
+
+    gamma_safe_set: float = 0.3
+    zero_at_goal: bool = True
+    monte_carlo: bool = False
+    failure_weight: float = 0.0
+    failure_rows: Literal["all", "violating"] = "all"
+    failure_value: float | None = None
+    mean_latents: tuple[str, ...] = ()
+    dynamics_horizon: int = 1
+    timed_out_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_fraction(self.gamma_safe_set, "gamma_safe_set")
+        require_choice(self.failure_rows, ("all", "violating"), "failure_rows")
+        require_at_least(self.dynamics_horizon, 1, "dynamics_horizon")
+        for name in ("failure_weight", "timed_out_weight"):
+            _require_not_negative(getattr(self, name), name)
+        unknown = sorted(set(self.mean_latents) - set(MEAN_LATENTS))
+        if unknown:
+            raise ValueError(f"mean_latents must be some of {', '.join(MEAN_LATENTS)}; got {', '.join(unknown)}.")
+        object.__setattr__(self, "mean_latents", tuple(self.mean_latents))
+
+
+@dataclass(frozen=True)
+class LS3Options:
+    """All settings of :class:`~ls3_torchrl.trainers.LS3Trainer`; the defaults are the paper's.
+
+    Args:
+        offline: gradient steps on the offline data.
+        online: gradient steps of one update.
+        optim: how everything is optimised.
+        loss: what the losses are.
+
+    Example:
+        >>> LS3Options(offline=OfflineOptions(dynamics_steps=500), optim=OptimOptions(batch_size=64)).online.fraction
+        0.0
+    """
+
+    offline: OfflineOptions = field(default_factory=OfflineOptions)
+    online: OnlineOptions = field(default_factory=OnlineOptions)
+    optim: OptimOptions = field(default_factory=OptimOptions)
+    loss: LossOptions = field(default_factory=LossOptions)

@@ -1,0 +1,232 @@
+"""VAETrainer: encoder and decoder learn the latents that all else is learnt on (equation (1))."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.record.loggers import Logger
+
+from ls3_torchrl.agent import LS3Agent
+from ls3_torchrl.data import TaggedReplayBuffer, random_perspective, random_resized_crop
+from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
+from ls3_torchrl.trainers.learner import LOG_INTERVAL, log_scalars, threads, wants_bf16
+from ls3_torchrl.trainers.options import VAEOptions
+from ls3_torchrl.trainers.progress import progress_bar
+
+_log = logging.getLogger(__name__)
+PHASE = "VAE"
+#: Squared error, as a fraction of the images' variance, above which a VAE hardly sees what moves.
+_COLLAPSED = 0.6
+
+
+def warmed_up(fraction: float, warmup: Sequence[float] | None) -> float:
+    """What a weight has risen to after a fraction of the steps: from 0 at the start of ``warmup`` to 1 at its end."""
+    if warmup is None:
+        return 1.0
+    start, end = warmup
+    return min(max((fraction - start) / (end - start), 0.0), 1.0)
+
+
+class VAETrainer:
+    """Trains an agent's encoder and decoder on all frames of a buffer, freezes them, and encodes every frame.
+
+    Args:
+        agent: its encoder and decoder are trained in place, and its dynamics with them where
+            ``options.prediction_weight`` asks for it.
+        buffer: filled with the offline data.
+        options: how.
+        logger: one of TorchRL's; gets every metric as ``VAE/name``.
+        progress: show progress bars.
+
+    Raises:
+        ValueError: for an agent whose encoder is not a VAE's or that has no decoder; an encoder that is trained already
+            needs none of this, but ``buffer.encode(agent.encoder)``.
+        FloatingPointError: by :meth:`train`, when the loss is not finite.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> step = {"reward": -torch.ones(9, 1), "pixels": torch.zeros(9, 3, 64, 64, dtype=torch.uint8)}
+        >>> step |= {k: torch.zeros(9, 1, dtype=torch.bool) for k in ("constraint", "success")}
+        >>> episode = TensorDict({"pixels": step["pixels"], "action": torch.zeros(9, 2), "next": step}, [9])
+        >>> buffer = TaggedReplayBuffer(capacity=100, latent_dim=8)
+        >>> buffer.add(episode, "success")
+        >>> agent = LS3Agent(action_dim=2, latent_dim=8)
+        >>> VAETrainer(agent, buffer, VAEOptions(steps=2, batch_size=4), progress=False).train()
+        >>> buffer.sample(4)["latent"].shape
+        torch.Size([4, 8])
+    """
+
+    def __init__(
+        self,
+        agent: LS3Agent,
+        buffer: TaggedReplayBuffer,
+        options: VAEOptions | None = None,
+        *,
+        logger: Logger | None = None,
+        progress: bool = True,
+    ) -> None:
+        self.agent, self.buffer = agent, buffer
+        self.options = options = VAEOptions() if options is None else options
+        self.logger, self.progress = logger, progress
+        if agent.encoder is None or agent.decoder is None:
+            raise ValueError(
+                "VAETrainer needs an agent with an encoder and a decoder. An encoder that is trained already needs no "
+                "VAETrainer: call buffer.encode(agent.encoder)."
+            )
+        self.steps = 0
+        for half in (agent.encoder, agent.decoder):
+            half.to(memory_format=torch.channels_last)
+        self.loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta, reduction=options.reduction)
+        self.loss.set_keys(pixels="vae_input", target="vae_target")
+        learnt = list(self.loss.parameters())
+        self.prediction: LatentPredictionLoss | None = None
+        if options.prediction_weight:
+            self.prediction = LatentPredictionLoss(agent.encoder, agent.dynamics)
+            keys = buffer.keys
+            self.prediction.set_keys(pixels=keys.observation, action=keys.action, next_pixels=keys.next_observation)
+            learnt += agent.dynamics.parameters()
+        self.optimizer = torch.optim.Adam(learnt, lr=options.lr, fused=True)
+        self.schedule: torch.optim.lr_scheduler.LRScheduler = (
+            torch.optim.lr_scheduler.OneCycleLR(self.optimizer, options.lr, total_steps=options.steps, pct_start=0.1)
+            if options.schedule == "onecycle"
+            else torch.optim.lr_scheduler.ConstantLR(self.optimizer, factor=1.0)
+        )
+        self.device = next(agent.parameters()).device
+        self._bf16 = wants_bf16(options.autocast, self.device)
+
+    def train(self) -> None:
+        """Train what is left of the steps, or take the checkpoint's encoder and decoder; freeze both, encode."""
+        if self.options.checkpoint is not None:
+            self._take_checkpoint(self.options.checkpoint)
+            return
+        self._minimise()
+        for half in (self.agent.encoder, self.agent.decoder):
+            half.requires_grad_(False)
+        self.encode()
+        if self.options.unit_scale:
+            spread = float(self.buffer.transitions.storage[:]["loc"].std(0).square().mean().sqrt())
+            self.agent.encoder.rescale(1.0 / spread)
+            self.agent.decoder.rescale(1.0 / spread)
+            self.encode()
+
+    def encode(self) -> None:
+        """Encode every frame of the buffer."""
+        with progress_bar(len(self.buffer.frames), "Encoding", unit="frame", enabled=self.progress) as bar:
+            self.buffer.encode(self.agent.encoder, progress=lambda done, _: bar.update(done - bar.n))
+
+    def _take_checkpoint(self, path: str) -> None:
+        """Take encoder and decoder of a trained agent, frozen, and encode every frame."""
+        shape = self.agent.architecture
+        trained = LS3Agent.load(
+            path, in_channels=shape.in_channels, latent_dim=shape.latent_dim, background=shape.background
+        )
+        for half, other in ((self.agent.encoder, trained.encoder), (self.agent.decoder, trained.decoder)):
+            half.load_state_dict(other.state_dict())
+            half.requires_grad_(False)
+        self.encode()
+
+    def _minimise(self) -> None:
+        options = self.options
+        if self.steps == 0 and self.agent.decoder.background is not None:
+            self.agent.decoder.set_background(self.buffer.mean_frame())
+        with (
+            threads(options.threads),
+            progress_bar(options.steps - self.steps, PHASE, enabled=self.progress) as bar,
+        ):
+            while self.steps < options.steps:
+                losses = self._step()
+                if self.steps % LOG_INTERVAL == 0 or self.steps == options.steps - 1:
+                    scalars = self._log(losses)
+                    bar.set_postfix_str(f"error {scalars['reconstruction']:.2e}", refresh=False)
+                self.steps += 1
+                bar.update()
+        if options.reduction == "mean":
+            self._warn_of_collapse(scalars["reconstruction"])
+
+    def _step(self) -> TensorDictBase:
+        options = self.options
+        warmth = warmed_up((self.steps + 1) / options.steps, options.warmup)
+        self.loss.beta = options.beta * warmth
+        batch = self._sample()
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
+            losses = self.loss(batch)
+            value = losses["loss_vae"]
+            if self.prediction is not None and warmth:
+                losses["prediction"] = self.prediction(batch)["loss_prediction"]
+                value = value + warmth * options.prediction_weight * losses["prediction"]
+        self.optimizer.zero_grad()
+        value.backward()
+        self.optimizer.step()
+        self.schedule.step()
+        return losses
+
+    def _sample(self) -> TensorDictBase:
+        """Images to reconstruct and what the encoder sees of them; with a prediction term, also what comes next."""
+        options = self.options
+        if self.prediction is None:
+            batch = self.buffer.sample_frames(options.batch_size)
+        else:
+            steps = options.prediction_horizon
+            left_out = None if self.buffer.dynamics_after_violation else "after_violation"
+            batch = self.buffer.sample_frame_transitions(
+                options.batch_size, without=left_out, steps=steps if steps > 1 else None
+            )
+        batch = batch.to(self.device)
+        target = batch["vae_target"] = self._enlarge(batch[self.buffer.keys.observation])
+        crop = options.crop_scale
+        batch["vae_input"] = target if crop is None else random_resized_crop(target, scale=crop)
+        return batch
+
+    def _enlarge(self, pixels: Tensor) -> Tensor:
+        """Images as if drawn from a dataset that shifts and perspectives have enlarged (section 1.3.4)."""
+        goal, there = self.options.enlarge_to, len(self.buffer.frames)
+        if goal is None or goal <= there:
+            return pixels
+        changed = torch.rand(len(pixels)) > there / goal
+        if changed.any():
+            pixels = pixels.clone()
+            pixels[changed] = random_perspective(pixels[changed])
+        return pixels
+
+    def _log(self, losses: TensorDictBase) -> dict[str, float]:
+        scalars = {key: item.item() for key, item in losses.items()}
+        if not all(map(math.isfinite, scalars.values())):
+            raise FloatingPointError(f"The VAE diverged: {scalars} at step {self.steps}. Lower vae.lr.")
+        log_scalars(self.logger, PHASE, self.steps, scalars)
+        return scalars
+
+    def _warn_of_collapse(self, error: float) -> None:
+        """Say so when the VAE draws little more than the mean of all images: nothing can be learnt from its latents."""
+        images = self.buffer.sample_frames(512)[self.buffer.keys.observation].float() / 255.0
+        variance = float((images - images.mean(0)).square().mean())
+        if error > _COLLAPSED * variance:
+            _log.warning(
+                "The VAE hardly sees what moves: its squared error is %.1e, that of the mean image %.1e. Try more "
+                "steps, a higher learning rate, or a later warmup.",
+                error,
+                variance,
+            )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, optimiser, schedule and step."""
+        return {
+            "loss": self.loss.state_dict(),
+            "dynamics": self.agent.dynamics.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "schedule": self.schedule.state_dict(),
+            "steps": self.steps,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue where :meth:`state_dict` was taken."""
+        self.loss.load_state_dict(state_dict["loss"])
+        self.agent.dynamics.load_state_dict(state_dict["dynamics"])
+        self.optimizer.load_state_dict(state_dict["optimizer"])
+        self.schedule.load_state_dict(state_dict["schedule"])
+        self.steps = state_dict["steps"]

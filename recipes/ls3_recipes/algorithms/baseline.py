@@ -1,0 +1,230 @@
+"""What the baselines share: networks, frozen latents or convolutions, batches, cloning, files and pictures."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
+from torchrl.objectives import BCLoss, LossModule
+from torchrl.record.loggers import Logger
+
+from ls3_recipes.algorithms.base import Algorithm, make_agent
+from ls3_recipes.plots.agent import plot_reconstructions
+from ls3_recipes.plots.plane import Field, maps, over_plane, plane_of
+from ls3_recipes.run_settings import RunSettings, at_least, one_of, positive
+from ls3_torchrl import LS3Agent
+from ls3_torchrl.baselines import PixelFeatures, action_bounds
+from ls3_torchrl.data import Tag, TaggedReplayBuffer
+from ls3_torchrl.files import save_atomically
+from ls3_torchrl.trainers import Learner, VAETrainer
+
+FORMAT = "ls3_torchrl.comparison"
+VERSION = 1
+DEMONSTRATIONS = (Tag.SUCCESS,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicySettings:
+    """The actor of a baseline.
+
+    Args:
+        hidden: hidden layers of every network.
+        lr: Adam's learning rate, above 0.
+        batch_size: transitions in a step.
+        cloning_steps: gradient steps of the actor's mean on the successful demonstrations.
+    """
+
+    hidden: tuple[int, ...] = (256, 256)
+    lr: float = 3.0e-4
+    batch_size: int = 256
+    cloning_steps: int = 5000
+
+    def __post_init__(self) -> None:
+        """Refuse what would only fail after time was spent."""
+        for size in self.hidden:
+            at_least(size, 1, "hidden")
+        positive(self.lr, "lr")
+        at_least(self.batch_size, 1, "batch_size")
+        at_least(self.cloning_steps, 0, "cloning_steps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActorCriticSettings(PolicySettings):
+    """An actor whose critics learn from penalised rewards.
+
+    Args:
+        penalty: λ, added to the reward of a violation; at most 0.
+        initial_std: of an untrained actor, before squashing.
+        tau: of the lagged critics; a value that is wrong for ever sinks by 1 in 1 / tau steps.
+        zero_at_goal: the goal ends the task, whatever happens after.
+        critic_steps: gradient steps offline.
+        updates_per_step: gradient steps online, for each step of the environment.
+    """
+
+    penalty: float
+    initial_std: float = 0.3
+    tau: float = 0.05
+    zero_at_goal: bool = False
+    critic_steps: int = 5000
+    updates_per_step: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Refuse what would only fail after time was spent."""
+        super().__post_init__()
+        if self.penalty > 0.0:
+            raise ValueError(f"penalty is added to the reward of a violation: 0 or below, got {self.penalty}.")
+        positive(self.initial_std, "initial_std")
+        positive(self.tau, "tau")
+        at_least(self.critic_steps, 0, "critic_steps")
+        at_least(self.updates_per_step, 0, "updates_per_step")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaselineSettings(RunSettings):
+    """What a run of a baseline has, beside what every run has.
+
+    Args:
+        encoder: ``"latents"``, the means of the VAE that LS³ trains, frozen; or ``"conv"``, convolutions of each
+            network's own.
+        policy: of the actor and, where it has them, its critics.
+    """
+
+    encoder: Literal["latents", "conv"] = "latents"
+    policy: PolicySettings
+
+    def __post_init__(self) -> None:
+        """Refuse unknown encoders."""
+        one_of(self.encoder, ("latents", "conv"), "encoder")
+
+
+class Baseline(Algorithm):
+    """Actor, and what it reads: the frozen latents of LS³'s VAE, or images through convolutions of its own."""
+
+    settings: BaselineSettings
+
+    def __init__(self, settings: BaselineSettings, env: TransformedEnv, device: torch.device) -> None:
+        self.settings = settings
+        self.vae: LS3Agent | None = None
+        if settings.encoder == "latents":
+            # The networks that LS³ would make: with the same seed, encoder and latents are LS³'s, bit by bit.
+            self.vae = make_agent(settings, env, device)
+        self.observation = "pixels" if self.vae is None else "loc"
+        low, high = action_bounds(env.action_spec)
+        self.half = (high - low).to(device) / 2
+        with torch.random.fork_rng():  # leaves the VAE's training the random stream that LS³'s has
+            self.networks = nn.ModuleDict(self.build(self._builder(env, device)))
+        if self.vae is not None:
+            assert self.vae.decoder is not None
+            self.networks.update({"encoder": self.vae.encoder, "decoder": self.vae.decoder})
+        self.policy = self._seeing(self.act())
+
+    def _builder(self, env: TransformedEnv, device: torch.device) -> Callable[..., Any]:
+        """What calls a network's constructor with what all of them share."""
+        channels = env.observation_spec["pixels"].shape[-3]
+
+        def build(make: Callable[..., Any], **more: Any) -> Any:
+            return make(
+                env.action_spec,
+                PixelFeatures.size if self.vae is None else self.vae.architecture.latent_dim,
+                observation_key=self.observation,
+                features=PixelFeatures(channels) if self.vae is None else None,
+                hidden=tuple(self.settings.policy.hidden),
+                **more,
+            ).to(device)
+
+        return build
+
+    def build(self, build: Callable[..., Any]) -> dict[str, nn.Module]:
+        """The networks by name; one is the ``actor``."""
+        raise NotImplementedError
+
+    def act(self) -> TensorDictModuleBase:
+        """What acts on observations."""
+        return self.networks["actor"]
+
+    def _seeing(self, policy: TensorDictModuleBase) -> TensorDictModuleBase:
+        return policy if self.vae is None else TensorDictSequential(self.vae.encoder, policy)
+
+    def begin(self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int) -> None:
+        """Make the learner that clones."""
+        self.buffer, self.logger = buffer, logger
+        with warnings.catch_warnings():  # TorchRL's own class lacks an annotation that TorchRL looks for
+            warnings.filterwarnings("ignore", "The name target_actor_network_params wasn't part of the annotations")
+            cloning = BCLoss(self.networks["actor"], loss_function=self._distance)
+        self.cloning = self.learner("bc", cloning, lambda: self.sample(DEMONSTRATIONS))
+
+    def learner(
+        self, names: str | list[str], loss: LossModule, sample: Callable[[], TensorDictBase], **how: Any
+    ) -> Learner:
+        """A learner with the policy's learning rate."""
+        return Learner(names, loss, sample, lr=self.settings.policy.lr, logger=self.logger, **how)
+
+    def _distance(self, predicted: Tensor, expert: Tensor) -> Tensor:
+        """Squared distances of actions, in units of half their range."""
+        return ((predicted - expert) / self.half).square()
+
+    def sample(self, tags: Iterable[Tag]) -> TensorDictBase:
+        """A batch of transitions, with images where the networks read them."""
+        return self.buffer.sample(self.settings.policy.batch_size, tags=tags, observations=self.vae is None)
+
+    def phases(self) -> dict[str, Callable[[], None]]:
+        """The VAE where one is read, and cloning."""
+        return ({} if self.vae is None else {"vae": self._train_vae}) | {"cloning": self._clone}
+
+    def _train_vae(self) -> None:
+        assert self.vae is not None
+        VAETrainer(self.vae, self.buffer, self.settings.vae, logger=self.logger).train()
+
+    def _clone(self) -> None:
+        with set_exploration_type(ExplorationType.DETERMINISTIC):  # the actor's mean
+            self.cloning.train(self.settings.policy.cloning_steps, "Cloning")
+
+    def update(self) -> None:
+        """Nothing is learnt."""
+
+    def save(self, path: Path) -> Path:
+        """Write the networks' weights."""
+        content = {
+            "format": FORMAT,
+            "version": VERSION,
+            "algorithm": self.name,
+            "state_dict": self.networks.state_dict(),
+        }
+        return save_atomically(content, path)
+
+    def restore(self, path: Path) -> None:
+        """Take the weights of a file of the same algorithm."""
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        if content.get("format") != FORMAT or content["version"] != VERSION or content["algorithm"] != self.name:
+            raise ValueError(f"{path} holds no networks of {self.name}. Pass a file that this algorithm's run wrote.")
+        self.networks.load_state_dict(content["state_dict"])
+
+    def fields(self, rows: TensorDictBase) -> dict[str, Field]:
+        """What can be drawn over the plane, of rows ``[n]`` with observation and the actor's action."""
+        return {}
+
+    @torch.no_grad()
+    def plot(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> None:
+        """Reconstructions of the VAE; value and risk over the plane where the states are one."""
+        if self.vae is not None:
+            plot_reconstructions(folder, self.vae, offline)
+        env = plane_of(self.settings.task)
+        if env is None:
+            return
+
+        def act(pixels: Tensor) -> TensorDictBase:
+            rows = TensorDict({"pixels": pixels.to(self.half.device)}, [len(pixels)])
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                return self._seeing(self.networks["actor"])(rows)
+
+        fields = self.fields(over_plane(env, act))
+        if fields:
+            maps(folder, env, fields, offline)

@@ -1,0 +1,151 @@
+"""LS³ under the protocol: the VAE, the latent models, and the planner that acts by them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
+from torchrl.record.loggers import Logger
+
+from ls3_recipes.algorithms.base import Algorithm, make_agent
+from ls3_recipes.options import as_dict, errors_of, from_signatures
+from ls3_recipes.plots.agent import plot_agent
+from ls3_recipes.plots.style import Label
+from ls3_recipes.run_settings import EpisodeSettings, RunSettings
+from ls3_torchrl import LS3Agent
+from ls3_torchrl.data import Tag, TaggedReplayBuffer
+from ls3_torchrl.planners import CrossEntropyMethod, LS3Planner, describe_plan
+from ls3_torchrl.trainers import (
+    LossOptions,
+    LS3Options,
+    LS3Trainer,
+    OfflineOptions,
+    OnlineOptions,
+    OptimOptions,
+    StateProbe,
+    VAETrainer,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnlineSettings(EpisodeSettings, OnlineOptions):
+    """The episodes of online improvement, and the gradient steps of each update."""
+
+    def __post_init__(self) -> None:
+        """Check both."""
+        EpisodeSettings.__post_init__(self)
+        OnlineOptions.__post_init__(self)
+
+
+BufferSettings = from_signatures(
+    "BufferSettings",
+    "The arguments of :class:`~ls3_torchrl.data.TaggedReplayBuffer` that matter to LS³.",
+    TaggedReplayBuffer,
+    only=("capacity", "gamma", "success_tail", "dynamics_after_violation", "continue_failures"),
+)
+
+PlannerSettings = from_signatures(
+    "PlannerSettings",
+    "The options of :class:`~ls3_torchrl.planners.LS3Planner` and of the cross-entropy method.",
+    LS3Planner,
+    CrossEntropyMethod,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LS3Settings(RunSettings):
+    """What a run of LS³ has, beside what every run has."""
+
+    buffer: BufferSettings  # type: ignore[valid-type]
+    online: OnlineSettings
+    offline: OfflineOptions
+    optim: OptimOptions
+    loss: LossOptions
+    planner: PlannerSettings  # type: ignore[valid-type]
+
+    def __post_init__(self) -> None:
+        """Refuse what only the sections together are wrong in."""
+        if self.loss.monte_carlo and not as_dict(self.buffer)["continue_failures"]:
+            raise ValueError(
+                "loss.monte_carlo needs buffer.continue_failures=true: otherwise a failure's return ends with the "
+                "horizon and is no lower bound."
+            )
+
+    @property
+    def training(self) -> LS3Options:
+        """The settings of the latent models' training."""
+        return LS3Options(offline=self.offline, online=self.online, optim=self.optim, loss=self.loss)
+
+
+class LS3(Algorithm):
+    """VAE, latent models and planner, in the paper's order."""
+
+    key = name = "ls3"
+    settings_class = LS3Settings
+    labels = {"ls3": Label("LS³", "#1b7f79")}  # noqa: RUF012
+    needs = (Tag.SUCCESS, Tag.CONSTRAINT)
+
+    def __init__(self, settings: LS3Settings, env: TransformedEnv, device: torch.device) -> None:
+        self.settings: LS3Settings = settings
+        options = as_dict(settings.planner)
+        self.agent = make_agent(settings, env, device, planner=options)
+        with errors_of("planner", options):
+            self.policy = self.agent.planner()
+
+    def prepare(self, env: TransformedEnv) -> None:
+        """The planner carries its last plan on from step to step."""
+        env.append_transform(self.policy.make_tensordict_primer())
+
+    def begin(self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int) -> None:
+        """Make the learners of every equation."""
+        self.buffer, self.logger = buffer, logger
+        self.trainer = LS3Trainer(self.agent, buffer, self.settings.training, episode_length=horizon, logger=logger)
+
+    def phases(self) -> dict[str, Callable[[], None]]:
+        """Equation (1), then the others on its latents."""
+        return {"vae": self._train_vae, "offline": self.trainer.train_offline}
+
+    def _train_vae(self) -> None:
+        VAETrainer(self.agent, self.buffer, self.settings.vae, logger=self.logger).train()
+
+    def update(self) -> None:
+        """One update of all latent models."""
+        self.trainer.update()
+
+    def describe(self, episodes: TensorDictBase) -> dict[str, float]:
+        """How often the planner relaxed the safe set or fell back."""
+        return dict(describe_plan(episodes).to_dict())
+
+    def diagnose(self, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> dict[str, float]:
+        """How well latents and imagination know the simulator's state, where the episodes keep it."""
+        return probe(self.agent, list(offline.values()), evaluation, self.policy.horizon)
+
+    def save(self, path: Path) -> Path:
+        """As a file of :class:`~ls3_torchrl.LS3Agent`."""
+        return self.agent.save(path)
+
+    def restore(self, path: Path) -> None:
+        """Take the networks of such a file; one of another shape, or with actions in other units, is refused."""
+        self.agent.load_state_dict(LS3Agent.load(path, **asdict(self.agent.architecture)).state_dict())
+
+    def plot(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> None:
+        """Reconstructions, timelines, and maps and plans where the states are a plane."""
+        plot_agent(folder, self.settings, self.agent, self.policy, offline, evaluation)
+
+
+def probe(agent: LS3Agent, offline: list[TensorDictBase], evaluation: TensorDictBase, horizon: int) -> dict[str, float]:
+    """Errors of a state read from latents, and from latents imagined ``horizon`` steps ahead.
+
+    Nothing where the episodes keep no state, or are shorter than the horizon.
+    """
+    episodes = [*offline, evaluation]
+    if any(part.get("state", None) is None for part in episodes) or evaluation.shape[1] < horizon:
+        return {}
+    latents = StateProbe(agent, offline)
+    # What was imagined on the agent's own way is read by a probe that has seen the way.
+    imagined = StateProbe(agent, episodes).imagination_error(evaluation, horizon=horizon)
+    return {"state_error": round(latents.error, 3), f"imagined_{horizon}_steps_error": round(imagined, 3)}

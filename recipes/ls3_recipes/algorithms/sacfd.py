@@ -1,0 +1,206 @@
+"""SACfD: soft actor-critic from demonstrations (section 1.1.2), with learnt recovery zones if asked for (1.1.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.envs import TransformedEnv
+from torchrl.objectives import DDPGLoss, SACLoss
+from torchrl.record.loggers import Logger
+
+from ls3_recipes.algorithms.actor_critic import ActorCritic
+from ls3_recipes.algorithms.baseline import DEMONSTRATIONS, ActorCriticSettings, BaselineSettings
+from ls3_recipes.options import as_dict
+from ls3_recipes.plots.plane import Field
+from ls3_recipes.plots.style import Label
+from ls3_recipes.run_settings import at_least, positive
+from ls3_torchrl.baselines import RecoveryPolicy, SafetyCritic, SafetyCriticLoss, deterministic_actor
+from ls3_torchrl.data import ALL_TAGS, Tag, TaggedReplayBuffer
+
+
+@dataclass(frozen=True, kw_only=True)
+class RiskSettings:
+    """The safety critic of recovery RL (section 1.1.3).
+
+    Args:
+        gamma: γ_risk, in [0, 1].
+        threshold: ε_risk, in [0, 1]: riskier actions are left to the recovery policy.
+        offline_steps: gradient steps on the offline data.
+    """
+
+    gamma: float
+    threshold: float
+    offline_steps: int
+
+    def __post_init__(self) -> None:
+        """Refuse what is no probability."""
+        for name in ("gamma", "threshold"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}.")
+        at_least(self.offline_steps, 0, "offline_steps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACfDPolicySettings(ActorCriticSettings):
+    """Actor and critics of soft actor-critic.
+
+    Args:
+        alpha: weight of the entropy, for rewards of -1 a step; above 0.
+        learn_alpha: whether it is learnt.
+        risk: of the safety critic.
+    """
+
+    alpha: float = 0.02
+    learn_alpha: bool = False
+    risk: RiskSettings
+
+    def __post_init__(self) -> None:
+        """Refuse what would only fail after time was spent."""
+        super().__post_init__()
+        positive(self.alpha, "alpha")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACfDSettings(BaselineSettings):
+    """What a run of SACfD has.
+
+    Args:
+        recovery: recovery RL: a safety critic, and a policy that takes over where the task's own is too risky.
+    """
+
+    recovery: bool = False
+    policy: SACfDPolicySettings
+
+    def __post_init__(self) -> None:
+        """Refuse what is neither with nor without."""
+        super().__post_init__()
+        if not isinstance(self.recovery, bool):
+            raise ValueError(f"recovery must be true or false, got {self.recovery!r}.")
+
+
+class SACfD(ActorCritic):
+    """Soft actor-critic that starts from an imitating actor and a critic of the demonstrations."""
+
+    key = name = "sacfd"
+    settings_class = SACfDSettings
+    labels = {  # noqa: RUF012
+        "sacfd_rrl": Label("SACfD+RRL", "#d1495b"),
+        "sacfd": Label("SACfD", "#e0a458"),
+    }
+    settings: SACfDSettings
+
+    def __init__(self, settings: SACfDSettings, env: TransformedEnv, device: torch.device) -> None:
+        self.recovery = settings.recovery
+        if self.recovery:
+            self.name = "sacfd_rrl"
+            self.needs = (Tag.SUCCESS, Tag.CONSTRAINT)
+        super().__init__(settings, env, device)
+
+    def build(self, build: Callable[..., Any]) -> dict[str, nn.Module]:
+        """Actor and critic; with recovery, a safety critic and a policy that keeps its risk low."""
+        networks = super().build(build)
+        if self.recovery:
+            networks |= {"safety_critic": build(SafetyCritic), "recovery": build(deterministic_actor)}
+        return networks
+
+    def act(self) -> TensorDictModuleBase:
+        """The actor, or whoever acts in its place."""
+        if not self.recovery:
+            return super().act()
+        threshold = self.settings.policy.risk.threshold
+        return RecoveryPolicy(super().act(), self.networks["recovery"], self._safety_critic, threshold)
+
+    @property
+    def _safety_critic(self) -> SafetyCritic:
+        critic = self.networks["safety_critic"]
+        assert isinstance(critic, SafetyCritic)
+        return critic
+
+    def make_buffer(self, device: torch.device, **labels: Any) -> TaggedReplayBuffer:
+        """With recovery, with what the task's policy wanted, beside what was done."""
+        return super().make_buffer(device, extra_keys=("task_action",) if self.recovery else (), **labels)
+
+    def offline_data(self, offline: dict[Tag, TensorDictBase]) -> dict[Tag, TensorDictBase]:
+        """What was done offline was what was wanted."""
+        if not self.recovery:
+            return offline
+        return {tag: episodes.copy().set("task_action", episodes["action"]) for tag, episodes in offline.items()}
+
+    def begin(self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int) -> None:
+        """Make the learners."""
+        super().begin(buffer, logger, horizon)
+        policy, sac = self.settings.policy, self._sac_loss()
+        self.critic = self.learner("qvalue", sac, lambda: self.sample(DEMONSTRATIONS), tau=policy.tau)
+        names = ["actor", "qvalue", *(["alpha"] if policy.learn_alpha else [])]
+        self.both = self.learner(names, sac, self._sample_wanted, tau=policy.tau)
+        if self.recovery:
+            self._make_recovery_learners()
+
+    def _sac_loss(self) -> SACLoss:
+        policy, gamma = self.settings.policy, as_dict(self.settings.buffer)["gamma"]
+        # In the actions' own units entropies lie this much above those in units of half the box. Without a correction,
+        # every step would be rewarded for the units that the actions are measured in.
+        offset = float(self.half.log().sum())
+        if not policy.learn_alpha:
+            self.bonus = gamma * policy.alpha * offset
+        loss = SACLoss(
+            self.networks["actor"],
+            self.networks["critic"],
+            loss_function="l2",
+            alpha_init=policy.alpha,
+            fixed_alpha=not policy.learn_alpha,
+            target_entropy=offset - float(len(self.half)),
+        )
+        loss.make_value_estimator(gamma=gamma)
+        return loss
+
+    def _make_recovery_learners(self) -> None:
+        policy = self.settings.policy
+        risk = SafetyCriticLoss(self._safety_critic, super().act(), gamma=policy.risk.gamma)
+        self.risk = self.learner("safety", risk, lambda: self.sample(ALL_TAGS), tau=policy.tau)
+        safer = DDPGLoss(self.networks["recovery"], self.networks["safety_critic"], delay_value=False)
+        safer.set_keys(state_action_value="safety")
+        safer.make_value_estimator(gamma=policy.risk.gamma)
+        self.safer = self.learner("actor", safer, lambda: self.sample(ALL_TAGS))
+
+    def _sample_wanted(self) -> TensorDictBase:
+        """Of demonstrations and online episodes; with recovery, with the actions that the task's policy wanted."""
+        rows = self.sample((*DEMONSTRATIONS, Tag.ONLINE))
+        return rows.set("action", rows["task_action"]) if self.recovery else rows
+
+    def phases(self) -> dict[str, Callable[[], None]]:
+        """Cloning, the critic of the demonstrations, and with recovery the risk in all data."""
+        policy = self.settings.policy
+        phases = super().phases() | {"critic": lambda: self.critic.train(policy.critic_steps, "Critic")}
+        if self.recovery:
+            phases["risk"] = lambda: self._train_risk(policy.risk.offline_steps)
+        return phases
+
+    def _train_risk(self, steps: int) -> None:
+        self.risk.train(steps, "Safety critic")
+        self.safer.train(steps, "Recovery policy")
+
+    def update(self) -> None:
+        """Actor and critic, from demonstrations and online episodes; risk from all data."""
+        super().update()
+        if self.recovery:
+            self._train_risk(self.steps_per_update)
+
+    def describe(self, episodes: TensorDictBase) -> dict[str, float]:
+        """How often the recovery policy took over."""
+        return {"recovery_rate": float(episodes["recovered"].float().mean())} if self.recovery else {}
+
+    def fields(self, rows: TensorDictBase) -> dict[str, Field]:
+        """The critic's value of what the actor would do, and its risk."""
+        fields = super().fields(rows)
+        if self.recovery:
+            level = self.settings.policy.risk.threshold
+            risk = self._safety_critic(rows)["risk"].flatten()
+            fields["Risk $Q_{risk}$"] = Field(risk, "OrRd", limits=(0.0, 1.0), level=level)
+        return fields

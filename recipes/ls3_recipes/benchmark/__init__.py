@@ -1,0 +1,1 @@
+"""How long everything takes here, beside the same networks with nothing done for speed."""

@@ -1,0 +1,26 @@
+"""``ls3 benchmark``: how long everything takes on this machine."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from ls3_recipes.benchmark.suite import BenchmarkSettings, run_benchmark
+from ls3_recipes.configuration import register, run_command
+from ls3_recipes.renamed import RENAMED_OF_BENCHMARK, rename_overrides
+
+HELP = """
+Time planning, updates, the VAE, encoding, environments and buffer; write benchmark.json and a table.
+
+  ls3 benchmark [presets=[cpu,paper]] [domains=[NAME,...]] [batches=[1,8,32]] [seconds=S] [reference=false]
+
+Every figure is a median with its interquartile range; ratios are taken within the run.
+"""
+
+register("benchmark", BenchmarkSettings)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point."""
+    arguments = rename_overrides(sys.argv[1:] if arguments is None else arguments, RENAMED_OF_BENCHMARK)
+    run_command("benchmark", BenchmarkSettings, run_benchmark, arguments, help_text=HELP)

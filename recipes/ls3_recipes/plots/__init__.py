@@ -1,0 +1,1 @@
+"""Pictures: of any run, of an LS³ agent, of several runs, and of the domains."""

@@ -1,0 +1,150 @@
+"""A run's folder: settings, versions, metrics, checkpoints, summary; and the logger that fills it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+import time
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+from torchrl.record.loggers import Logger
+
+PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "mujoco", "mujoco-warp", "hydra-core", "ls3-torchrl")
+
+
+class RunLogger(Logger):
+    """Writes scalars named ``phase/name`` to ``metrics.csv`` and to TensorBoard.
+
+    Args:
+        folder: the run's folder; ``metrics.csv`` and ``tensorboard/`` are made in it.
+
+    Example:
+        >>> import tempfile
+        >>> folder = tempfile.mkdtemp()
+        >>> logger = RunLogger(folder)
+        >>> logger.log_scalar("Safe set/loss_safe_set", 0.25, step=100)
+        >>> logger.close()
+        >>> [(row["phase"], row["step"], row["name"], row["value"]) for row in read_metrics(folder)]
+        [('Safe set', '100', 'loss_safe_set', '0.25')]
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self._start = time.perf_counter()
+        self._csv = (Path(folder) / "metrics.csv").open("w", newline="")
+        self._rows = csv.writer(self._csv)
+        self._rows.writerow(["seconds", "phase", "step", "name", "value"])
+        super().__init__(exp_name="tensorboard", log_dir=str(folder))
+
+    def _create_experiment(self) -> SummaryWriter:
+        return SummaryWriter(str(Path(self.log_dir) / self.exp_name))
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the logger was made."""
+        return time.perf_counter() - self._start
+
+    def log_scalar(self, name: str, value: float, step: int | None = None) -> None:
+        """One metric; what stands before the last slash of its name is its phase."""
+        phase, _, metric = name.rpartition("/")
+        self._rows.writerow([f"{self.seconds:.1f}", phase, step, metric, f"{value:.6g}"])
+        self._csv.flush()
+        self.experiment.add_scalar(name, value, step)
+
+    def log_video(self, name: str, video: Tensor, step: int | None = None, **options: Any) -> None:
+        """A video ``[N, T, C, H, W]``, to TensorBoard."""
+        self.experiment.add_video(name, video, global_step=step, **options)
+
+    def log_hparams(self, cfg: Any) -> None:
+        """Settings, to TensorBoard; the run's own are in ``config.yaml``."""
+        self.experiment.add_text("settings", f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(cfg))}```")
+
+    def log_histogram(self, name: str, data: Sequence, **options: Any) -> None:
+        """A histogram, to TensorBoard."""
+        self.experiment.add_histogram(name, data, options.get("step"))
+
+    def close(self, timeout: float | None = None) -> None:
+        """Write what is left, and close table and board."""
+        self._csv.close()
+        super().close(timeout)
+
+    def __repr__(self) -> str:
+        return f"RunLogger({self.log_dir!r})"
+
+
+class RunFolder:
+    """A run's folder: ``config.yaml``, ``versions.json``, ``metrics.csv``, ``tensorboard/``, ``checkpoints/``.
+
+    Args:
+        path: must not exist, so that no earlier run is ever overwritten.
+        settings: the run's settings, written at once.
+
+    Raises:
+        FileExistsError: when the folder exists.
+    """
+
+    def __init__(self, path: str | Path, settings: Mapping[str, Any]) -> None:
+        self.path = require_new(path)
+        self.path.mkdir(parents=True)
+        (self.path / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(dict(settings))))
+        self.write_json("versions.json", versions())
+        self.logger = RunLogger(self.path)
+
+    @property
+    def minutes(self) -> float:
+        """Minutes since the folder was made."""
+        return round(self.logger.seconds / 60, 2)
+
+    def checkpoint(self, update: int) -> Path:
+        """Where the agent is kept after ``update`` updates."""
+        return self.path / "checkpoints" / f"agent_{update:03d}.pt"
+
+    def write_json(self, name: str, content: dict) -> Path:
+        """Write a JSON file in one go: a half-written file never takes its place."""
+        path = self.path / name
+        partial = path.with_suffix(".partial")
+        partial.write_text(json.dumps(content, indent=2) + "\n")
+        partial.replace(path)
+        return path
+
+    def close(self) -> None:
+        """Flush and close what is open."""
+        self.logger.close()
+
+
+def require_new(path: str | Path) -> Path:
+    """The path of an output folder that does not exist yet.
+
+    Raises:
+        FileExistsError: when it does.
+    """
+    path = Path(path)
+    if path.exists():
+        raise FileExistsError(
+            f"The output folder {path} exists already, and no run overwrites another. Choose another with output=DIR, "
+            "or move the old one away."
+        )
+    return path
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that decide what a run does."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # run from a clone that is not installed
+            found[name] = "not installed"
+    return found
+
+
+def read_metrics(folder: str | Path) -> list[dict[str, str]]:
+    """The rows of a run's ``metrics.csv``."""
+    with (Path(folder) / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))

@@ -1,0 +1,121 @@
+"""The command ``ls3``: its commands, its help, and what it says when it cannot go on."""
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import ls3_envs
+from ls3_recipes import commands
+from ls3_recipes.commands import COMMANDS, main
+
+RECIPES = Path(__file__).parents[3] / "recipes"
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
+def test_the_commands_are_listed(capsys, arguments):
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert all(f"  {name} " in printed for name in COMMANDS)
+
+
+def test_an_unknown_command_is_refused_with_those_that_exist(capsys):
+    assert main(["trian"]) == 2
+    assert f"no command 'trian'. It has: {', '.join(COMMANDS)}." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_is_a_file_with_an_entry_point_and_a_door(name):
+    assert callable(importlib.import_module(f"ls3_recipes.commands.{name}").main)
+    doors = ["ls3", "bc", "sacfd", "awac"] if name == "train" else [name]
+    for door in doors:
+        source = (RECIPES / f"{door}.py").read_text()
+        assert f"from ls3_recipes.commands.{name} import main" in source
+        assert len(source.splitlines()) < 10
+    assert {path.stem for path in Path(commands.__file__).parent.glob("[a-z]*.py")} == set(COMMANDS)
+
+
+@pytest.mark.parametrize("missing", ["hydra", "mujoco", "matplotlib.pyplot"])
+def test_without_the_extra_the_remedy_is_named(capsys, monkeypatch, missing):
+    def fail(name):
+        raise ModuleNotFoundError(f"No module named {missing!r}", name=missing)
+
+    monkeypatch.setattr(commands, "import_module", fail)
+    assert main(["train"]) == 1
+    assert "pip install 'ls3-torchrl[recipes]'" in capsys.readouterr().err
+
+
+def test_a_module_that_is_missing_for_another_reason_is_no_matter_of_extras(monkeypatch):
+    def fail(name):
+        raise ModuleNotFoundError("No module named 'ls3_recipes.gone'", name="ls3_recipes.gone")
+
+    monkeypatch.setattr(commands, "import_module", fail)
+    with pytest.raises(ModuleNotFoundError, match="gone"):
+        main(["train"])
+
+
+def test_choosing_a_command_imports_only_what_it_needs():
+    code = (
+        "import sys; from ls3_recipes.commands import main; main(['--help']); "
+        "heavy = {'torch', 'torchrl', 'hydra', 'matplotlib', 'mujoco'} & set(sys.modules); "
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "gallery"])
+def test_help_says_what_can_be_set_and_runs_nothing(name, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert main([name, "--help"]) == 0
+    printed = capsys.readouterr().out
+    assert f"ls3 {name} " in printed
+    assert "All settings, with the values that these arguments give" in printed
+    assert "output:" in printed
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_for_an_algorithm_shows_choices_and_its_own_settings_with_the_arguments_values(capsys):
+    main(["train", "algorithm=sacfd", "preset=paper", "policy.alpha=0.5", "--help"])
+    printed = capsys.readouterr().out
+    for word in (*ls3_envs.DOMAINS, "cpu", "paper", "smoke", "alpha: 0.5", "ls3 train", "output="):
+        assert word in printed
+    assert "planner:" not in printed
+    main(["train", "preset=paper", "--help"])
+    assert "num_candidates: 1000" in capsys.readouterr().out
+
+
+def test_the_gallerys_help(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["gallery", "--help"])
+    assert stopped.value.code == 0
+    assert all(domain in capsys.readouterr().out for domain in ["FILE.png"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "algorithm=sacfd", "planner.horizon=9"], "ls3 train: planner.horizon=9: sacfd has no planner."),
+        (["train", "algorithm=dqn"], "ls3 train: algorithm must be one of"),
+        (["train", "preset=smoke", "vae.steps=0"], "ls3 train: vae.steps must be at least 1, got 0."),
+        (["collect", "planner.horizon=9"], "ls3 collect: planner.horizon=9: ls3 collect has no planner."),
+    ],
+)
+def test_settings_that_cannot_be_end_the_command_with_one_line(monkeypatch, tmp_path, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["ls3"])
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert str(stopped.value).startswith(message)
+    assert "\n" not in str(stopped.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("door", [["-m", "ls3_recipes", "train", "algorithm=bc"], [str(RECIPES / "bc.py")]])
+def test_a_run_from_another_folder_leaves_its_folder_there_and_nothing_else(tmp_path, door):
+    arguments = ["preset=smoke", "online.updates=0", "vae.steps=1", "task.horizon=4", "pictures=false", "output=mine"]
+    subprocess.run([sys.executable, *door, *arguments], cwd=tmp_path, check=True, capture_output=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+    assert (tmp_path / "mine" / "summary.json").is_file()

@@ -1,0 +1,73 @@
+"""The two small commands, on what the large one left."""
+
+import json
+
+import pytest
+from omegaconf import OmegaConf
+from PIL import Image
+
+from ls3_recipes.commands.collect import CollectSettings, collect
+from ls3_recipes.commands.evaluate import EvaluateSettings, evaluate
+from ls3_recipes.configuration import compose_settings
+from ls3_torchrl.data import Tag, load_episodes
+
+
+def evaluated(*arguments):
+    return evaluate(compose_settings("evaluate", EvaluateSettings, ["device=cpu", *arguments]))
+
+
+def test_collect_saves_what_train_reads(tmp_path):
+    folder = tmp_path / "mine"
+    settings = compose_settings("collect", CollectSettings, [f"output={folder}", "seed=4", "task.offline_episodes=2"])
+    assert collect(settings) == folder
+    episodes = load_episodes(folder, task="navigation")
+    assert {tag: tuple(data.shape) for tag, data in episodes.items()} == {
+        Tag.SUCCESS: (2, 100),
+        Tag.CONSTRAINT: (2, 100),
+    }
+    with pytest.raises(FileExistsError, match="output=DIR"):
+        collect(settings)
+
+
+def test_collect_names_its_folder_after_task_and_seed():
+    settings = compose_settings("collect", CollectSettings, ["task=reacher", "seed=4"])
+    assert (settings.output, settings.task.name) == ("data/reacher-seed4", "reacher")
+
+
+def test_evaluate_runs_a_trained_agent_and_leaves_summary_and_video(run_folder, tmp_path):
+    folder = tmp_path / "evaluation"
+    summary = evaluated(f"run={run_folder}", "episodes=3", f"output={folder}")
+    assert summary["evaluation"]["episodes"] == 3
+    assert json.loads((folder / "summary.json").read_text()) == summary
+    with Image.open(folder / "evaluation.gif") as video:
+        assert video.n_frames == 12
+
+
+def test_evaluate_takes_an_earlier_checkpoint_and_other_planner_settings(run_folder, tmp_path):
+    folder = tmp_path / "evaluation"
+    evaluated(
+        f"run={run_folder}",
+        "agent=checkpoints/agent_000.pt",
+        "episodes=1",
+        f"output={folder}",
+        "planner.num_candidates=8",
+    )
+    written = OmegaConf.load(folder / "config.yaml")
+    assert written.planner.num_candidates == 8
+    assert written.planner.horizon == 3  # the run's
+
+
+def test_planner_settings_that_fit_no_planner_are_refused(run_folder, tmp_path):
+    with pytest.raises(ValueError, match=r"^planner\.num_elites must lie"):
+        evaluated(f"run={run_folder}", "planner.num_elites=1000", f"output={tmp_path / 'evaluation'}")
+    assert not (tmp_path / "evaluation").exists()
+
+
+def test_evaluate_refuses_a_folder_that_is_no_run(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"config\.yaml is missing"):
+        evaluated(f"run={tmp_path}")
+
+
+def test_evaluate_says_that_a_run_is_needed():
+    with pytest.raises(Exception, match="run"):
+        evaluated()

@@ -1,0 +1,69 @@
+"""Imports inside the recipes only go down, and no file or function grows out of sight."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[2] / "recipes" / "ls3_recipes"
+
+# What each part may import of the package, besides itself.
+LOWEST = {"options", "renamed", "console", "device", "figures"}
+MAY_IMPORT: dict[str, set[str]] = {part: set() for part in LOWEST}
+MAY_IMPORT["run_settings"] = {"options"}
+MAY_IMPORT["run_folder"] = set()
+MAY_IMPORT["rollout"] = {"console", "run_settings"}
+MAY_IMPORT["plots"] = {"run_folder", "run_settings"}
+MAY_IMPORT["algorithms"] = {"options", "run_settings", "plots"}
+MAY_IMPORT["configuration"] = {"options", "renamed", "run_settings", "algorithms"}
+MAY_IMPORT["protocol"] = LOWEST | {"run_settings", "run_folder", "rollout", "plots", "algorithms"}
+MAY_IMPORT["benchmark"] = LOWEST | {"run_settings", "run_folder", "algorithms", "configuration"}
+MAY_IMPORT["commands"] = set(MAY_IMPORT)
+MAY_IMPORT["__main__"] = {"commands"}
+MAY_IMPORT["__init__"] = set()
+
+
+def sources():
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def part_of(path):
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imported(tree):
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("ls3_recipes"):
+            assert node.level == 0
+            parts = node.module.split(".")
+            yield from ([parts[1]] if len(parts) > 1 else [alias.name for alias in node.names])
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_only_go_down(path):
+    part = part_of(path)
+    assert part in MAY_IMPORT, f"{part} is new: say in MAY_IMPORT what it may import"
+    assert set(imported(ast.parse(path.read_text()))) - {part} <= MAY_IMPORT[part]
+
+
+def test_the_table_has_no_circle():
+    done: set[str] = set()
+    while len(done) < len(MAY_IMPORT):
+        ready = {part for part, below in MAY_IMPORT.items() if part not in done and below <= done}
+        assert ready, f"a circle among {set(MAY_IMPORT) - done}"
+        done |= ready
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_a_file_is_one_idea_and_a_function_one_thought(path):
+    source = path.read_text()
+    assert len(source.splitlines()) <= 300
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef):
+            assert node.end_lineno - node.lineno < 55, f"{node.name} has {node.end_lineno - node.lineno + 1} lines"
+
+
+def test_no_setting_of_hydra_travels_below_the_doors():
+    for path in sources():
+        if part_of(path) not in ("configuration",):
+            assert "DictConfig" not in path.read_text(), path.name

@@ -1,0 +1,85 @@
+"""Former names of settings are read, with a warning that gives the present one."""
+
+import pytest
+from omegaconf import OmegaConf
+
+from ls3_recipes.algorithms import ALGORITHMS
+from ls3_recipes.configuration import settings_of_run, train_settings
+from ls3_recipes.options import as_dict, defaults
+from ls3_recipes.renamed import RENAMED, RENAMED_OF_BENCHMARK, rename_overrides, rename_settings
+
+
+def has(name):
+    for algorithm in ALGORITHMS.values():
+        node = defaults(algorithm.settings_class)
+        for key in name.split("."):
+            node = node.get(key, {}) if isinstance(node, dict) else {}
+        if node != {}:
+            return True
+    return False
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED.items())
+def test_every_present_name_is_a_setting_and_no_former_one_is(old, new):
+    assert has(new)
+    assert not has(old)
+
+
+@pytest.mark.parametrize("prefix", ["", "+", "++", "~"])
+def test_arguments_are_renamed_with_a_warning(prefix):
+    with pytest.warns(UserWarning, match=r"vae\.agent is now called vae\.checkpoint"):
+        assert rename_overrides([f"{prefix}vae.agent=a=b", "seed=1"]) == [f"{prefix}vae.checkpoint=a=b", "seed=1"]
+    with pytest.warns(UserWarning, match="plain is now called reference"):
+        assert rename_overrides(["plain=false"], RENAMED_OF_BENCHMARK) == ["reference=false"]
+
+
+def test_what_only_begins_like_a_former_name_stays():
+    overrides = ["loss.gamma_safe_set=0.5", "--help", "vae.agents=3", "online.share"]
+    assert rename_overrides(overrides) == overrides
+
+
+def test_an_argument_by_its_former_name_sets_the_present_one():
+    with pytest.warns(UserWarning, match=r"buffer\.success_tail"):
+        assert as_dict(train_settings("preset=smoke", "loss.success_tail=4"))["buffer"]["success_tail"] == 4
+
+
+def test_settings_of_files_are_renamed_and_empty_sections_vanish():
+    old = {"loss": {"gamma": 0.9, "gamma_safe_set": 0.3}, "task": {"name": "reacher", "risk": {"gamma": 0.5}}}
+    with pytest.warns(UserWarning, match="is now called"):
+        new = rename_settings(old)
+    assert new == {
+        "loss": {"gamma_safe_set": 0.3},
+        "task": {"name": "reacher"},
+        "buffer": {"gamma": 0.9},
+        "policy": {"risk": {"gamma": 0.5}},
+    }
+    assert old["loss"]["gamma"] == 0.9
+
+
+def test_where_both_names_are_there_the_present_one_counts():
+    with pytest.warns(UserWarning, match=r"policy\.penalty"):
+        new = rename_settings({"task": {"name": "a", "sacfd_penalty": -3}, "policy": {"penalty": -1}})
+    assert new["policy"] == {"penalty": -1}
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_run_of_before_the_renaming_has_the_settings_that_it_had(tmp_path, algorithm):
+    settings = train_settings(f"algorithm={algorithm}", "preset=smoke", "buffer.gamma=0.9", "buffer.success_tail=7")
+    old = as_dict(settings)
+    # As they were written before: under their former names, with what the task alone had.
+    for former, present in RENAMED.items():
+        *path, name = present.split(".")
+        section = old
+        for key in path:
+            section = section.get(key, {})
+        if name in section:
+            *path, last = former.split(".")
+            target = old
+            for key in path:
+                target = target.setdefault(key, {})
+            target[last] = section[name] if former.startswith("task.") and "policy" in present else section.pop(name)
+    old["task"] |= {"sacfd_penalty": -3.0, "risk": {"gamma": 0.95, "threshold": 0.8}}
+    assert not old.pop("buffer")
+    OmegaConf.save(OmegaConf.create(old), tmp_path / "config.yaml")
+    with pytest.warns(UserWarning, match="is now called"):
+        assert settings_of_run(tmp_path) == settings

@@ -1,0 +1,57 @@
+"""A run's folder and its logger."""
+
+import json
+import platform
+from importlib.metadata import version
+
+import pytest
+from omegaconf import OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torchrl.record.loggers import Logger
+
+from ls3_recipes.run_folder import RunFolder, RunLogger, read_metrics
+
+
+def test_scalars_go_to_the_table_and_to_tensorboard(tmp_path):
+    logger = RunLogger(tmp_path)
+    assert isinstance(logger, Logger)
+    logger.log_scalar("Value, TD-1/loss_value", 1.0 / 3.0, step=7)
+    logger.log_scalar("online/mean_return", -50, step=4)
+    rows = read_metrics(tmp_path)  # written at once, not when the run ends
+    logger.close()
+    assert [{k: v for k, v in row.items() if k != "seconds"} for row in rows] == [
+        {"phase": "Value, TD-1", "step": "7", "name": "loss_value", "value": "0.333333"},
+        {"phase": "online", "step": "4", "name": "mean_return", "value": "-50"},
+    ]
+    assert all(0.0 <= float(row["seconds"]) < 60.0 for row in rows)
+    board = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert board.Tags()["scalars"] == ["Value, TD-1/loss_value", "online/mean_return"]
+    assert board.Scalars("online/mean_return")[0].step == 4
+
+
+def test_metrics_of_a_dictionary_are_taken_as_every_logger_of_torchrl_takes_them(tmp_path):
+    logger = RunLogger(tmp_path)
+    logger.log_metrics({"a/x": 1.0, "a/y": 2.0}, step=3)
+    logger.close()
+    assert [(row["phase"], row["name"]) for row in read_metrics(tmp_path)] == [("a", "x"), ("a", "y")]
+
+
+def test_a_folder_begins_with_settings_and_versions_and_is_never_reused(tmp_path):
+    folder = RunFolder(tmp_path / "run", {"seed": 3, "agent": {"hidden": [16]}})
+    folder.close()
+    assert OmegaConf.load(folder.path / "config.yaml") == {"seed": 3, "agent": {"hidden": [16]}}
+    versions = json.loads((folder.path / "versions.json").read_text())
+    assert versions["torch"] == version("torch")
+    assert versions["python"] == platform.python_version()
+    assert folder.checkpoint(7).name == "agent_007.pt"
+    with pytest.raises(FileExistsError, match=r"exists already.*output=DIR"):
+        RunFolder(tmp_path / "run", {})
+
+
+def test_a_file_is_written_whole_or_not_at_all(tmp_path):
+    folder = RunFolder(tmp_path / "run", {})
+    folder.write_json("summary.json", {"a": 1})
+    with pytest.raises(TypeError):
+        folder.write_json("summary.json", {"a": object()})
+    folder.close()
+    assert json.loads((folder.path / "summary.json").read_text()) == {"a": 1}

@@ -1,0 +1,219 @@
+"""A learner: what it starts from, minimises and follows, how divergence is reported, and how it continues."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded
+from torchrl.objectives import HardUpdate
+from torchrl.record.loggers import CSVLogger
+
+from ls3_torchrl import LS3Agent
+from ls3_torchrl.baselines import AWACLoss, action_value, gaussian_actor
+from ls3_torchrl.modules import ValueEnsemble
+from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, TD1ValueLoss
+from ls3_torchrl.trainers import AuxiliaryLoss, Learner
+from ls3_torchrl.trainers.learner import cooled_down, threads
+
+
+def values(value, latent):
+    return value(TensorDict({"latent": latent}, [len(latent)]))["state_value"]
+
+
+def test_td1_starts_from_what_reward_to_go_had_learnt():
+    # With a target made beforehand, TD-1 pulled every value back towards that of an untrained network.
+    value = ValueEnsemble(4, num_members=2, hidden=(16,))
+    z = torch.randn(64, 4)
+    reached = {"latent": z, "reward": torch.full((64, 1), -1.0)}
+    batch = TensorDict({"latent": z, "reward_to_go": torch.full((64, 1), -100.0), "next": reached}, [64])
+    first = Learner("value", OfflineValueLoss(value), lambda: batch, lr=0.03, progress=False)
+    second = Learner(
+        "value", TD1ValueLoss(value, gamma=0.99), lambda: batch, lr=0.03, target_interval=100, progress=False
+    )
+    first.train(400, "Value, reward-to-go")
+    assert values(value, z).mean().item() == pytest.approx(-100.0, abs=1.0)
+    second.train(150, "Value, TD-1")
+    # -1 + 0.99 * -100 = -100: the values that solve equation (3) solve equation (4) as well.
+    assert values(value, z).mean().item() == pytest.approx(-100.0, abs=2.0)
+
+
+def awac():
+    spec = Bounded(low=-1.0, high=1.0, shape=(1,))
+    loss = AWACLoss(gaussian_actor(spec, 2, hidden=(4,)), action_value(spec, 2, hidden=(4,)))
+    loss.make_value_estimator(gamma=0.9)
+    over = {key: torch.ones(8, 1, dtype=torch.bool) for key in ("done", "terminated")}
+    reached = {"loc": torch.randn(8, 2), "reward": torch.randn(8, 1), **over}
+    return loss, TensorDict({"loc": torch.randn(8, 2), "action": torch.zeros(8, 1), "next": reached}, [8])
+
+
+@pytest.mark.parametrize(("names", "moved"), [("qvalue", [False, True]), (["actor", "qvalue"], [True, True])])
+def test_the_losses_that_are_named_are_minimised_together_and_logged_alone(recorder, names, moved):
+    loss, batch = awac()
+    params = (loss.actor_network_params, loss.qvalue_network_params)
+    before = [p.clone().data for p in params]
+    Learner(names, loss, batch.clone, lr=0.1, tau=0.25, logger=recorder, progress=False).train(1, "AWAC")
+    logged = {name.removeprefix("AWAC/") for name, _, _ in recorder.rows if name.startswith("AWAC/loss_")}
+    assert logged == {f"loss_{name}" for name in ([names] if isinstance(names, str) else names)}
+    assert [bool((a != b.data).any()) for a, b in zip(before, params, strict=True)] == moved
+
+
+def test_with_tau_the_target_moves_a_fraction_of_the_way_at_every_step():
+    loss, batch = awac()
+    learner = Learner("qvalue", loss, batch.clone, lr=0.1, tau=0.25, progress=False)
+    learner.train(1, "AWAC")  # its updater starts from a copy
+    old = loss.qvalue_network_params.data.clone()
+    lagging = loss.target_qvalue_network_params.data.clone()
+    learner.train(1, "AWAC")
+    new = loss.qvalue_network_params.data
+    torch.testing.assert_close(loss.target_qvalue_network_params.data, 0.75 * lagging + 0.25 * new)
+    assert bool((old != new).any())
+
+
+def test_a_loss_that_is_not_finite_stops_the_phase_with_a_remedy():
+    value = ValueEnsemble(4, num_members=2, hidden=(8,))
+    bad = TensorDict({"latent": torch.randn(8, 4), "reward_to_go": torch.full((8, 1), torch.nan)}, [8])
+    learner = Learner("value", OfflineValueLoss(value), lambda: bad, lr=1e-3, progress=False)
+    with pytest.raises(FloatingPointError, match=r"Value diverged.*learning rate"):
+        learner.train(3, "Value")
+
+
+def test_an_auxiliary_loss_pulls_the_same_network_with_its_weight(recorder):
+    value = ValueEnsemble(4, num_members=1, hidden=(16,))
+    z = torch.zeros(32, 4)
+    near_batch = TensorDict({"latent": z, "reward_to_go": torch.full((32, 1), -5.0)}, [32])
+    far_batch = TensorDict({"latent": z, "reward_to_go": torch.full((32, 1), -60.0)}, [32])
+    # On the same states, a term of weight 3 draws the least-squares value to three quarters of the way.
+    both = AuxiliaryLoss(3.0, OfflineValueLoss(value), lambda: far_batch)
+    learner = Learner(
+        "value",
+        OfflineValueLoss(value),
+        lambda: near_batch,
+        lr=0.05,
+        auxiliary=both,
+        logger=recorder,
+        progress=False,
+    )
+    learner.train(600, "Value")
+    middle = (-5.0 + 3.0 * -60.0) / 4.0
+    assert values(value, z[:1]).item() == pytest.approx(middle, abs=0.5)
+    assert recorder.values("Value/auxiliary")
+
+
+@pytest.mark.parametrize("name", ["dynamics", "value", "safe_set"])
+def test_losses_and_gradients_under_bf16_agree_with_fp32(name):
+    agent = LS3Agent(action_dim=2, latent_dim=8)
+    rows = TensorDict(
+        {
+            "latent": torch.randn(256, 5, 8),
+            "action": torch.randn(256, 5, 2),
+            "reward_to_go": -60.0 - 5.0 * torch.rand(256, 5, 1),
+            "in_success": torch.rand(256, 5, 1) < 0.5,
+            "next": {"latent": torch.randn(256, 5, 8)},
+        },
+        [256, 5],
+    )
+    losses = {
+        "dynamics": (EnsembleDynamicsLoss(agent.dynamics, bootstrap=True), rows),
+        "value": (OfflineValueLoss(agent.value, bootstrap=True), rows),
+        "safe_set": (SafeSetLoss(agent.safe_set, gamma=0.3), rows[:, 0]),
+    }
+    loss, batch = losses[name]
+    if name == "safe_set":
+        HardUpdate(loss, value_network_update_interval=99)
+    found = []
+    for bf16 in (False, True):
+        learner = Learner(name, loss, lambda: batch, lr=1e-3, bf16=bf16)
+        learner.optimizer.zero_grad()
+        _, value = learner.compute_loss()
+        value.backward()
+        assert all(p.grad.dtype == torch.float32 for p in learner.parameters)
+        found.append((value.detach(), torch.cat([p.grad.flatten() for p in learner.parameters])))
+    (exact, gradient), (rough, rounded) = found
+    torch.testing.assert_close(rough, exact, rtol=5e-3, atol=0.0)
+    assert not torch.equal(rounded, gradient)
+    assert (rounded - gradient).norm() < 0.05 * gradient.norm()  # bf16 rounds by 0.4 % at every product
+
+
+def test_the_learning_rate_falls_to_nothing_in_the_last_part_of_every_phase():
+    fractions = (0.0, 0.25, 0.5, 0.75, 0.9)
+    assert [cooled_down(fraction, 0.5) for fraction in fractions] == pytest.approx([1, 1, 1, 0.5, 0.2])
+    assert cooled_down(0.99, 0.0) == 1.0
+    value = ValueEnsemble(4, num_members=2, hidden=(8,))
+    rows = TensorDict({"latent": torch.randn(8, 4), "reward_to_go": torch.zeros(8, 1)}, [8])
+    rates = []
+
+    def sample():
+        rates.append(learner.optimizer.param_groups[0]["lr"])
+        return rows
+
+    learner = Learner("value", OfflineValueLoss(value), sample, lr=0.4, cooldown=0.5, progress=False)
+    for _ in range(2):  # every phase starts warm again
+        learner.train(4, "Value")
+    assert rates == pytest.approx([0.4, 0.4, 0.4, 0.2] * 2)
+
+
+def td1_learner(seed):
+    torch.manual_seed(seed)
+    value = ValueEnsemble(4, num_members=2, hidden=(8,))
+    generator = torch.Generator().manual_seed(7)
+
+    def sample():
+        z = torch.randn(16, 4, generator=generator)
+        reached = {"latent": z + 0.1, "reward": -torch.rand(16, 1, generator=generator)}
+        return TensorDict({"latent": z, "next": reached}, [16])
+
+    learner = Learner("value", TD1ValueLoss(value), sample, lr=0.01, target_interval=5, progress=False)
+    return learner, generator
+
+
+def test_a_learner_that_continues_from_its_state_ends_as_one_that_was_never_stopped():
+    whole, _ = td1_learner(0)
+    whole.train(12, "Value")
+    first, generator = td1_learner(0)
+    first.train(8, "Value")  # between two copies to the target, with Adam's moments warm
+    second, later = td1_learner(1)
+    later.set_state(generator.get_state())
+    second.load_state_dict(first.state_dict())
+    second.train(4, "Value")
+    assert second.steps == whole.steps == 12
+    assert second.target.counter == whole.target.counter
+    for name, expected in whole.loss.state_dict().items():
+        assert torch.equal(second.loss.state_dict()[name], expected), name
+
+
+def test_a_state_keeps_whether_there_was_a_target_yet():
+    fresh, _ = td1_learner(0)
+    other, _ = td1_learner(1)
+    other.load_state_dict(fresh.state_dict())
+    assert other.target is None
+
+
+def test_progress_bars_can_be_switched_off(capsys):
+    learner, _ = td1_learner(0)
+    learner.train(2, "Value")
+    assert capsys.readouterr().err == ""
+    learner.progress = True
+    learner.train(2, "Value")
+    assert "Value" in capsys.readouterr().err
+
+
+def test_any_logger_of_torchrl_serves(tmp_path):
+    learner, _ = td1_learner(0)
+    learner.logger = CSVLogger("run", log_dir=str(tmp_path))
+    learner.train(3, "Value")
+    lines = (tmp_path / "run" / "scalars" / "Value" / "loss_value.csv").read_text().splitlines()
+    assert [int(line.split(",")[0]) for line in lines] == [1, 3]
+
+
+def test_threads_are_put_back_even_when_the_work_fails():
+    before = torch.get_num_threads()
+    inside = []
+
+    def fail():
+        with threads(before + 1):
+            inside.append(torch.get_num_threads())
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert inside == [before + 1]
+    assert torch.get_num_threads() == before

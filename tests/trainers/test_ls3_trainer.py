@@ -1,0 +1,241 @@
+"""LS³'s learners: which data each draws, what the options change, and that training continues where it stopped."""
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from ls3_torchrl import LS3Agent
+from ls3_torchrl.data import EpisodeKeys, Tag, TaggedReplayBuffer
+from ls3_torchrl.trainers import LossOptions, LS3Options, LS3Trainer, OfflineOptions, OnlineOptions, OptimOptions
+from ls3_torchrl.trainers.ls3 import LEARNERS
+
+OPTIM = OptimOptions(batch_size=16, autocast=False)
+
+
+def trainer_of(agent, buffer, **options):
+    return LS3Trainer(agent, buffer, LS3Options(**({"optim": OPTIM} | options)), progress=False)
+
+
+@pytest.fixture
+def filled(episode):
+    """A buffer with an episode of each tag, encoded by the agent."""
+
+    def make(agent, **options):
+        buffer = TaggedReplayBuffer(100, latent_dim=8, **options)
+        for tag in ("success", "constraint", "online"):
+            buffer.add(episode(actions=torch.randn(9, 2)), tag)
+        buffer.encode(agent.encoder)
+        return buffer
+
+    return make
+
+
+def test_each_learner_draws_from_the_data_that_the_paper_names(make_agent):
+    agent, buffer, drawn = make_agent(), TaggedReplayBuffer(100, latent_dim=8), {}
+
+    def sample(batch_size, selection, *, members=None):
+        assert selection.without is None
+        assert selection.steps is None
+        assert selection.online_fraction == 0.25
+        drawn[current] = ({tag.name.lower() for tag in selection.tags}, members)
+        raise KeyboardInterrupt
+
+    buffer.sample = sample
+    trainer = trainer_of(agent, buffer, online=OnlineOptions(fraction=0.25))
+    for current in LEARNERS:
+        with pytest.raises(KeyboardInterrupt):
+            trainer.learners[current].sample()
+    everything = {"success", "rand", "constraint", "online"}
+    assert drawn == {
+        "dynamics": (everything, agent.dynamics.num_members),
+        "value": ({"success", "online"}, agent.value.num_members),
+        "value_td": ({"success", "online"}, agent.value.num_members),
+        "safe_set": (everything, None),
+        "constraint": (everything, None),
+        "goal": (everything, None),
+    }
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_what_follows_a_violation_teaches_the_dynamics_as_the_buffer_says(make_agent, episode, wanted):
+    agent = make_agent()
+    buffer = TaggedReplayBuffer(100, latent_dim=8, dynamics_after_violation=wanted)
+    number = torch.arange(9.0).unsqueeze(-1).expand(-1, 2)
+    buffer.add(episode(actions=number, constraint=3), "constraint")
+    buffer.encode(agent.encoder)
+    trainer = trainer_of(agent, buffer)
+    steps = {int(step) for step in trainer.dynamics.sample()["action"].flatten().tolist()}
+    assert 3 in steps  # the step to the violation itself is not left out
+    assert (max(steps) > 3) == wanted
+    assert len(trainer.constraint.sample()["next", "constraint"].unique()) == 2
+
+
+def test_episodes_that_timed_out_count_as_the_option_says_online_alone(make_agent, episode):
+    agent = make_agent()
+    buffer = TaggedReplayBuffer(100, latent_dim=8)
+    buffer.add(episode(success=8), "success")
+    buffer.add(episode(), "rand")
+    for outcome in ({}, {"success": 8}, {"constraint": 8}):
+        buffer.add(episode(**outcome), "online")
+    buffer.encode(agent.encoder)
+    assert "safe_set_weight" not in trainer_of(agent, buffer).safe_set.sample()  # as in the paper
+    trainer = trainer_of(
+        agent, buffer, loss=LossOptions(timed_out_weight=0.25), optim=OptimOptions(batch_size=400, autocast=False)
+    )
+    rows = trainer.safe_set.sample()
+    weight = rows["safe_set_weight"].flatten()
+    light = weight == 0.25
+    assert light.any()
+    assert (weight[~light] == 1.0).all()
+    # The online episode that timed out is the third of the five that were added.
+    assert torch.equal(light, (rows["frame"].flatten() >= 20) & (rows["frame"].flatten() < 30))
+    assert (rows["tag"].flatten() == int(Tag.ONLINE))[light].all()
+    assert not any(rows["next", key].flatten()[light].any() for key in ("success", "constraint"))
+
+
+def test_failures_are_violating_demonstrations_at_the_value_of_failure(make_agent, filled):
+    agent = make_agent()
+    buffer = filled(agent)
+    trainer = trainer_of(agent, buffer, loss=LossOptions(failure_weight=0.5, failure_value=-42.0))
+    rows = trainer.value.auxiliary.sample()
+    assert (rows["tag"] == int(Tag.CONSTRAINT)).all()
+    assert (rows["reward_to_go"] == -42.0).all()
+    assert trainer.value.auxiliary.weight == 0.5
+    # The buffer itself keeps the returns that were seen.
+    assert (buffer.sample(50, tags=["constraint"])["reward_to_go"] > -42.0).all()
+
+
+@pytest.mark.parametrize(("length", "steps"), [(3, 3), (None, 9)])
+def test_failures_may_be_the_violating_states_and_have_the_value_of_an_episode_without_success(
+    make_agent, episode, length, steps
+):
+    agent = make_agent()
+    buffer = TaggedReplayBuffer(100, latent_dim=8)
+    buffer.add(episode(constraint=7), "constraint")
+    buffer.encode(agent.encoder)
+    options = LS3Options(loss=LossOptions(failure_weight=0.5, failure_rows="violating"), optim=OPTIM)
+    trainer = LS3Trainer(agent, buffer, options, episode_length=length, progress=False)
+    rows = trainer.value.auxiliary.sample()
+    assert rows.batch_size == (4, agent.value.num_members)
+    assert rows["next", "constraint"].all()
+    assert torch.equal(rows["latent"], rows["next", "latent"])
+    value = -sum(0.99**i for i in range(steps))
+    torch.testing.assert_close(rows["reward_to_go"], torch.full_like(rows["reward_to_go"], value))
+
+
+def test_without_discount_failing_costs_every_step(make_agent, filled):
+    agent = make_agent()
+    buffer = filled(agent, gamma=1.0)
+    trainer = trainer_of(agent, buffer, loss=LossOptions(failure_weight=0.5))
+    assert (trainer.value.auxiliary.sample()["reward_to_go"] == -9.0).all()
+
+
+def test_mean_latents_feed_posterior_means_to_the_models_that_are_named(make_agent, filled):
+    agent = make_agent()
+    trainer = trainer_of(agent, filled(agent), loss=LossOptions(mean_latents=("dynamics", "goal")))
+    assert trainer.dynamics.loss.tensor_keys.latent == "loc"
+    assert trainer.dynamics.loss.tensor_keys.next_latent == ("next", "loc")
+    assert trainer.goal.loss.tensor_keys.latent == ("next", "loc")
+    assert trainer.constraint.loss.tensor_keys.latent == ("next", "latent")
+    assert trainer.safe_set.loss.tensor_keys.latent == "latent"
+
+
+def test_the_discount_is_the_buffers(make_agent, filled):
+    agent = make_agent()
+    assert trainer_of(agent, filled(agent, gamma=0.7)).value_td.loss.gamma == 0.7
+
+
+def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_episode(make_agent, filled):
+    agent, loss = make_agent(), LossOptions(monte_carlo=True)
+    with pytest.raises(ValueError, match="continue_failures=True"):
+        trainer_of(agent, filled(agent), loss=loss)
+    trainer_of(agent, filled(agent, continue_failures=True), loss=loss)
+
+
+def test_phases_take_their_steps_in_the_papers_order(make_agent, filled, recorder):
+    agent = make_agent()
+    options = LS3Options(OfflineOptions(4, 2, 3, 1), OnlineOptions(2, 1, 2), OPTIM)
+    trainer = LS3Trainer(agent, filled(agent), options, logger=recorder, progress=False)
+    trainer.train_offline()
+    phases = list(dict.fromkeys(name.split("/")[0] for name, _, _ in recorder.rows))
+    assert phases == ["Dynamics", "Value, reward-to-go", "Value, TD-1", "Safe set", "Constraint", "Goal"]
+    steps = {name: learner.steps for name, learner in trainer.learners.items()}
+    assert steps == {"dynamics": 4, "value": 3, "value_td": 1, "safe_set": 2, "constraint": 2, "goal": 2}
+    trainer.update()
+    steps = {name: learner.steps for name, learner in trainer.learners.items()}
+    assert steps == {"dynamics": 6, "value": 3, "value_td": 3, "safe_set": 3, "constraint": 3, "goal": 3}
+
+
+def test_training_that_continues_from_its_state_ends_as_one_that_was_never_stopped(make_agent, filled):
+    options = LS3Options(OfflineOptions(3, 3, 3, 3), OnlineOptions(3, 3, 3), OptimOptions(16, target_interval=2))
+    torch.manual_seed(5)
+    source = make_agent()
+    buffer = filled(source)
+
+    def trainer(seed):
+        torch.manual_seed(seed)
+        return LS3Trainer(make_agent(), buffer, options, progress=False)
+
+    whole, first, second = trainer(0), trainer(0), trainer(1)
+    torch.manual_seed(9)
+    whole.train_offline()
+    whole.update()
+    torch.manual_seed(9)
+    first.train_offline()
+    second.load_state_dict(first.state_dict())
+    second.update()
+    for name in ("dynamics", "value", "safe_set", "constraint", "goal"):
+        pairs = zip(getattr(whole.agent, name).parameters(), getattr(second.agent, name).parameters(), strict=True)
+        assert all(torch.equal(a, b) for a, b in pairs), name
+
+
+def test_states_under_keys_of_ones_own_train_as_pixels_do(episode, recorder):
+    keys = EpisodeKeys(
+        observation=("robot", "state"),
+        action=("robot", "torque"),
+        reward=("next", "task", "reward"),
+        constraint=("next", "task", "hit"),
+        success=("next", "task", "done"),
+    )
+    standard = episode(actions=torch.randn(9, 2), success=6, constraint=4)
+    states = torch.randn(10, 3)
+    content = standard.empty()
+    content[keys.observation], content[keys.next_observation] = states[:-1], states[1:]
+    content[keys.action] = standard["action"]
+    for name in ("reward", "constraint", "success"):
+        content[getattr(keys, name)] = standard["next", name]
+    buffer = TaggedReplayBuffer(100, latent_dim=3, keys=keys)
+    for tag in ("success", "constraint"):
+        buffer.add(content, tag)
+    encoder = TensorDictModule(torch.nn.Identity(), [keys.observation], ["latent"])
+    agent = LS3Agent(action_dim=2, latent_dim=3, encoder=encoder, num_values=2, num_dynamics=2)
+    buffer.encode(agent.encoder)
+    options = LS3Options(OfflineOptions(2, 2, 2, 2), OnlineOptions(1, 1, 1), OPTIM, LossOptions(failure_weight=0.5))
+    trainer = LS3Trainer(agent, buffer, options, logger=recorder, progress=False)
+    trainer.train_offline()
+    trainer.update()
+    assert {name: learner.steps for name, learner in trainer.learners.items()} == {
+        name: 2 if name == "value" else 3 for name in LEARNERS
+    }
+    labels = trainer.goal.sample()[keys.success].float().mean()
+    assert 0.0 < labels < 1.0
+
+
+class Scalar(torch.nn.Module):
+    """A single value function, without members."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(8, 1)
+
+    def forward(self, latent):
+        return self.layer(latent)
+
+
+def test_a_value_function_without_members_trains_too(make_agent, filled):
+    value = TensorDictModule(Scalar(), ["latent"], ["state_value"])
+    agent = make_agent(value=value)
+    before = value.module.layer.weight.detach().clone()
+    options = LS3Options(OfflineOptions(2, 2, 2, 2), optim=OPTIM, loss=LossOptions(failure_weight=0.5))
+    LS3Trainer(agent, filled(agent), options, progress=False).train_offline()
+    assert not torch.equal(value.module.layer.weight, before)

@@ -1,0 +1,184 @@
+"""The VAE's training: what encoder and decoder learn from, what is said when they learn nothing, how it continues."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+
+from ls3_torchrl import LS3Agent
+from ls3_torchrl.data import EpisodeKeys, TaggedReplayBuffer
+from ls3_torchrl.objectives import VAELoss
+from ls3_torchrl.trainers import VAEOptions, VAETrainer
+
+FAST = {"steps": 3, "batch_size": 4, "crop_scale": None, "autocast": False}
+
+
+@pytest.fixture
+def filled(episode):
+    """Makes a buffer that holds one episode of noise, or the episode given."""
+
+    def make(content=None, **options):
+        buffer = TaggedReplayBuffer(100, latent_dim=8, **options)
+        buffer.add(episode(7) if content is None else content, "success")
+        return buffer
+
+    return make
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_a_decoder_with_a_background_starts_from_the_mean_image(make_agent, filled, episode, recorder, background):
+    buffer = filled(episode(grey=51))
+    VAETrainer(make_agent(background=background), buffer, VAEOptions(**FAST), logger=recorder, progress=False).train()
+    first = recorder.values("VAE/reconstruction")[0]
+    assert (first < 0.01) == background  # black is 0.2² = 0.04 away
+
+
+def test_batches_seem_drawn_from_the_enlarged_dataset(make_agent, filled):
+    buffer = filled()
+    pixels = torch.randint(256, (400, 3, 64, 64), dtype=torch.uint8)
+
+    def kept(goal):
+        trainer = VAETrainer(make_agent(), buffer, VAEOptions(**FAST, enlarge_to=goal), progress=False)
+        return (trainer._enlarge(pixels) == pixels).flatten(1).all(1).float().mean().item()
+
+    assert kept(None) == 1.0
+    assert kept(len(buffer.frames)) == 1.0
+    assert abs(kept(4 * len(buffer.frames)) - 0.25) < 0.08
+
+
+def test_unit_scale_measures_latents_in_their_spread_and_keeps_the_pictures(make_agent, filled, episode):
+    content = episode(7)
+    pictures, spreads = [], []
+    for unit_scale in (False, True):
+        torch.manual_seed(1)
+        agent, buffer = make_agent(), filled(content)
+        VAETrainer(agent, buffer, VAEOptions(**FAST, unit_scale=unit_scale), progress=False).train()
+        spreads.append(buffer.transitions.storage[:]["loc"].std(0).square().mean().sqrt().item())
+        pictures.append(agent.decoder(agent.encoder(content.select("pixels")))["reco_pixels"])
+    assert spreads[1] == pytest.approx(1.0, rel=1e-3)
+    assert spreads[0] != pytest.approx(1.0, rel=1e-2)
+    torch.testing.assert_close(*pictures)
+
+
+def test_the_prediction_term_trains_the_dynamics_along_by_its_weight(make_agent, filled, episode, recorder):
+    content = episode(7, actions=torch.randn(7, 2))
+    heads = []
+    for weight in (0.0, 1.0, 1.0, 2.0):
+        torch.manual_seed(1)
+        recorder.rows.clear()
+        agent, buffer = make_agent(), filled(content)
+        before = [p.detach().clone() for p in agent.dynamics.parameters()]
+        options = VAEOptions(**(FAST | {"steps": 20, "lr": 1e-3}), prediction_weight=weight)
+        VAETrainer(agent, buffer, options, logger=recorder, progress=False).train()
+        changed = [not torch.equal(a, b) for a, b in zip(before, agent.dynamics.parameters(), strict=True)]
+        assert any(changed) == (weight > 0.0)
+        assert bool(recorder.values("VAE/prediction")) == (weight > 0.0)
+        heads.append(agent.encoder[0].module.head.weight.detach())
+    # The encoder learns from it too, and the weight makes a difference where nothing else does.
+    assert not torch.equal(heads[0], heads[1])
+    assert torch.equal(heads[1], heads[2])
+    assert not torch.equal(heads[2], heads[3])
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_prediction_leaves_out_what_follows_a_violation_where_the_buffer_says_so(make_agent, filled, episode, wanted):
+    number = torch.arange(9.0).unsqueeze(-1).expand(-1, 2)
+    buffer = filled(episode(actions=number, constraint=3), dynamics_after_violation=wanted)
+    drawn, draw = [], buffer.sample_frame_transitions
+    buffer.sample_frame_transitions = lambda *a, **o: drawn.append(draw(*a, **o)) or drawn[-1]
+    options = VAEOptions(**(FAST | {"batch_size": 64}), prediction_weight=1.0)
+    VAETrainer(make_agent(), buffer, options, progress=False).train()
+    steps = {int(step) for batch in drawn for step in batch["action"].flatten().tolist()}
+    assert 3 in steps  # the step to the violation itself is not left out
+    assert (max(steps) > 3) == wanted
+
+
+@pytest.mark.parametrize(
+    ("warmup", "fractions"),
+    [(None, [1.0, 1.0, 1.0, 1.0]), ([0.0, 0.75], [1 / 3, 2 / 3, 1.0, 1.0]), ([0.25, 0.75], [0.0, 0.5, 1.0, 1.0])],
+)
+def test_beta_rises_over_its_fraction_of_the_steps(make_agent, filled, monkeypatch, warmup, fractions):
+    seen, forward = [], VAELoss.forward
+    monkeypatch.setattr(VAELoss, "forward", lambda self, td: (seen.append(self.beta), forward(self, td))[1])
+    options = VAEOptions(**(FAST | {"steps": 4}), beta=0.3, warmup=warmup)
+    VAETrainer(make_agent(), filled(), options, progress=False).train()
+    assert seen == pytest.approx([0.3 * fraction for fraction in fractions])
+
+
+@pytest.mark.parametrize(("error", "warned"), [(0.9, True), (0.3, False)])
+def test_a_vae_that_draws_the_mean_image_is_noticed(make_agent, filled, episode, caplog, error, warned):
+    # Black and white images in turn: their variance about the mean image is a quarter.
+    content = episode(19, grey=0)
+    content["pixels"][1::2], content["next", "pixels"][::2] = 255, 255
+    trainer = VAETrainer(make_agent(), filled(content), VAEOptions(**FAST), progress=False)
+    trainer._warn_of_collapse(0.25 * error)
+    assert ("hardly sees" in caplog.text) == warned
+
+
+def test_a_vae_can_be_taken_from_a_trained_agent_of_the_same_shape(make_agent, filled, episode, recorder, tmp_path):
+    trained, agent, content = make_agent(), make_agent(), episode(7)
+    options = VAEOptions(checkpoint=str(trained.save(tmp_path / "agent.pt")))
+    buffer = filled(content)
+    dynamics = [p.clone() for p in agent.dynamics.parameters()]
+    VAETrainer(agent, buffer, options, logger=recorder, progress=False).train()
+    assert recorder.rows == []  # nothing was trained
+    assert not any(p.requires_grad for p in agent.encoder.parameters())
+    assert all(torch.equal(a, b) for a, b in zip(dynamics, agent.dynamics.parameters(), strict=True))
+    seen = trained.encoder(content.select("pixels"))
+    torch.testing.assert_close(buffer.transitions.storage[:]["loc"], seen["loc"], atol=1e-4, rtol=1e-4)
+    with pytest.raises(ValueError, match="latent_dim 8 instead of 5"):
+        VAETrainer(make_agent(latent_dim=5), buffer, options, progress=False).train()
+
+
+def test_training_that_continues_from_its_state_ends_as_one_that_was_never_stopped(make_agent, filled, episode):
+    content = episode(7, actions=torch.randn(7, 2))
+    settings = {"batch_size": 4, "autocast": False, "schedule": "onecycle", "prediction_weight": 1.0, "lr": 1e-3}
+
+    def trainer(seed):
+        torch.manual_seed(seed)
+        return VAETrainer(make_agent(), filled(content), VAEOptions(steps=6, **settings), progress=False)
+
+    whole, first, second = trainer(0), trainer(0), trainer(1)
+    torch.manual_seed(3)
+    for _ in range(6):
+        whole._step()
+        whole.steps += 1
+    torch.manual_seed(3)
+    for _ in range(4):
+        first._step()
+        first.steps += 1
+    second.load_state_dict(first.state_dict())
+    second._minimise()
+    assert second.steps == 6
+    for half in ("encoder", "decoder", "dynamics"):
+        pairs = zip(getattr(whole.agent, half).parameters(), getattr(second.agent, half).parameters(), strict=True)
+        assert all(torch.equal(a, b) for a, b in pairs), half
+
+
+def test_images_under_a_key_of_ones_own(make_agent, episode, recorder):
+    content = episode(7)
+    content.rename_key_("pixels", ("camera", "image"))
+    content.rename_key_(("next", "pixels"), ("next", "camera", "image"))
+    buffer = TaggedReplayBuffer(50, latent_dim=8, keys=EpisodeKeys(observation=("camera", "image")))
+    buffer.add(content, "success")
+    from ls3_torchrl.modules import PixelDecoder, PixelEncoder
+
+    agent = make_agent(encoder=PixelEncoder(3, 8, pixels_key=("camera", "image")), decoder=PixelDecoder(3, 8))
+    options = VAEOptions(**FAST, prediction_weight=0.5)
+    VAETrainer(agent, buffer, options, logger=recorder, progress=False).train()
+    assert recorder.values("VAE/prediction")
+    assert buffer.sample(4)["latent"].shape == (4, 8)
+
+
+def test_an_encoder_without_a_decoder_needs_no_training():
+    encoder = TensorDictModule(torch.nn.Identity(), ["pixels"], ["latent"])
+    agent = LS3Agent(action_dim=2, latent_dim=4, encoder=encoder)
+    with pytest.raises(ValueError, match=r"buffer\.encode\(agent\.encoder\)"):
+        VAETrainer(agent, TaggedReplayBuffer(10, latent_dim=4))
+
+
+def test_a_loss_that_is_not_finite_stops_the_training(make_agent, filled, monkeypatch):
+    nothing = {"loss_vae": torch.tensor(torch.nan, requires_grad=True), "reconstruction": torch.tensor(0.0)}
+    monkeypatch.setattr(VAELoss, "forward", lambda self, td: TensorDict(nothing))
+    with pytest.raises(FloatingPointError, match="VAE diverged"):
+        VAETrainer(make_agent(), filled(), VAEOptions(**FAST), progress=False).train()
