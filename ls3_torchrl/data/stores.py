@@ -70,7 +70,9 @@ class RowStore(TensorDictReplayBuffer):
         """Write rows ``[n]``; returns where, int64 ``[n]``."""
         if self._folder is not None and not self.storage.initialized:
             _remove_store(self._folder)
-        return super().extend(rows, update_priority=update_priority)
+        # Else a store that is first written under inference_mode() could never be written outside of it.
+        with torch.inference_mode(False), torch.no_grad():
+            return super().extend(rows.detach(), update_priority=update_priority)
 
     def grow(self, capacity: int) -> None:
         """Make room for more rows: from the oldest on they lie in their order, the first one at 0."""

@@ -429,3 +429,23 @@ def test_the_mean_frame_is_that_of_all_frames_in_unit_floats(scratch):
     mean = buffer.mean_frame(frames=20_000)
     assert mean.shape == (3, 64, 64)
     torch.testing.assert_close(mean, torch.full_like(mean, 4.5 / 255), atol=0.1 / 255, rtol=0)
+
+
+@pytest.mark.parametrize("encoded", [True, False])
+def test_a_buffer_full_of_short_episodes_still_has_their_frames(scratch, encoded):
+    camera = Camera()
+    buffer = TaggedReplayBuffer(90, latent_dim=D, scratch_dir=scratch)
+    if encoded:
+        buffer.encode(reading_encoder())
+    room = buffer.frame_capacity
+    for _ in range(120):
+        buffer.add(camera.shoot(1), "online")
+        camera.frame %= 250  # grey values are bytes
+    assert buffer.frame_capacity > room
+    buffer.encode(reading_encoder())
+    rows = buffer.transitions.storage[:]
+    assert len(rows) == 90
+    torch.testing.assert_close(rows["loc"][:, 0], rows["action"][:, 0], atol=1e-2, rtol=0)
+    torch.testing.assert_close(rows["next", "loc"][:, 0], rows["action"][:, 0] + 1, atol=1e-2, rtol=0)
+    batch = buffer.sample_frame_transitions(50)
+    assert torch.equal(batch["pixels"][:, 0, 0, 0].float(), batch["action"][:, 0])

@@ -136,3 +136,20 @@ def test_no_pickle_of_a_dump_is_run(tmp_path):
     with pytest.raises(RuntimeError, match="Refusing to load pickled"):
         store.loads(tmp_path / "dump")
     assert content(store) == [0, 1, 2]
+
+
+def test_a_store_first_written_in_inference_mode_can_be_written_outside_of_it(make):
+    store = make(5)
+    with torch.inference_mode():
+        store.extend(rows(0, 2))
+        store.extend(rows(2, 1))
+    store.extend(rows(3, 1))
+    store.storage[:]["deep", "x"].add_(1)
+    assert content(store) == [1, 2, 3, 4]
+
+
+def test_no_graph_is_stored(make):
+    store, weight = make(5), torch.ones(1, requires_grad=True)
+    for _ in range(2):
+        store.extend(TensorDict({"x": weight * torch.ones(2, 1)}, [2]))
+    assert not store.storage[:]["x"].requires_grad
