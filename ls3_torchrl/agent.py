@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import pickle
 import warnings
 from collections.abc import Mapping, Sequence
@@ -27,7 +28,7 @@ from ls3_torchrl.modules import (
     SafeSet,
     ValueEnsemble,
 )
-from ls3_torchrl.planners import LatentEnv, LS3Planner
+from ls3_torchrl.planners import CrossEntropyMethod, LatentEnv, LS3Planner, Optimizer
 
 FORMAT = "ls3_torchrl.agent"
 VERSION = 2
@@ -94,10 +95,24 @@ def _plain(value: Any) -> Any:
     )
 
 
+def _storable(name: str, value: Any) -> Any:
+    """A setting as a file can hold it."""
+    plain = _plain(value)
+    for item in plain if isinstance(plain, tuple) else (plain,):
+        if item is not None and type(item) not in (bool, int, float, str, tuple):
+            raise ValueError(
+                f"The planner setting {name} holds a {type(item).__name__}, which an agent file cannot keep. Give it "
+                "as a number, text or tuple, or to planner() after loading."
+            )
+    return plain
+
+
 def _one_action(spec: TensorSpec) -> Bounded:
     """The bounds of one action, ``[A]``: of a batched spec, those of its first row."""
     if not isinstance(spec, Bounded):
         raise ValueError(f"Planning needs a bounded action spec, got {type(spec).__name__}.")
+    if not spec.shape:
+        raise ValueError("An action spec needs a dimension, [A]; got shape []. Give a single action as shape [1].")
     low, high = (bound.reshape(-1, spec.shape[-1])[0].cpu() for bound in (spec.space.low, spec.space.high))
     return Bounded(low=low, high=high, shape=low.shape, dtype=spec.dtype)
 
@@ -170,7 +185,7 @@ class LS3Agent(nn.Module):
                 raise ValueError("LS3Agent needs action_dim, or an action_spec that it can be read from; got neither.")
             action_dim = self.action_spec.shape[-1]
         self.planner_settings = dict(planner or {})
-        self.task = task
+        self.task = None if task is None else str(task)
         if isinstance(architecture.get("action_scale"), str):
             architecture["action_scale"] = self._half_range(architecture["action_scale"])
         self.architecture = shape = AgentArchitecture(action_dim, **architecture)
@@ -218,28 +233,40 @@ class LS3Agent(nn.Module):
             initial_value=shape.initial_value,
         )
 
-    def planner(self, action_spec: TensorSpec | None = None, **settings: Any) -> LS3Planner:
+    def planner(
+        self, action_spec: TensorSpec | None = None, *, optimizer: Optimizer | None = None, **settings: Any
+    ) -> LS3Planner:
         """The policy: an :class:`~ls3_torchrl.planners.LS3Planner` over this agent's modules.
 
-        Bounds and settings are remembered: a file written afterwards holds them, and its agent plans alike.
+        Bounds and settings are remembered: a file written afterwards holds them, and its agent plans alike. An
+        optimiser of one's own is not: pass it again.
 
         Args:
             action_spec: bounds of one action, shape ``[A]``; a batched spec's first row is taken. Those that the agent
                 was made for when ``None``.
-            settings: of the planner and its optimiser, in place of those that the agent was made for.
+            optimizer: in place of the cross-entropy method, whose remembered settings are then left aside.
+            settings: of the planner and the cross-entropy method, in place of those that the agent was made for.
 
         Raises:
             ValueError: when no bounds are known, or for settings out of range.
             TypeError: for an unknown setting.
         """
-        if action_spec is not None:
-            self.action_spec = _one_action(action_spec)
-        if self.action_spec is None:
+        spec = self.action_spec if action_spec is None else _one_action(action_spec)
+        if spec is None:
             raise ValueError("The bounds of the actions are not known: pass planner(action_spec=env.action_spec).")
-        self.planner_settings |= settings
-        device = next(self.parameters()).device
-        model = LatentEnv(self.dynamics, self.constraint, self.goal, action_spec=self.action_spec, device=device)
-        return LS3Planner(model, self.value, self.safe_set, self.encoder, **self.planner_settings)
+        remembered = self.planner_settings
+        if optimizer is not None:
+            cem = inspect.signature(CrossEntropyMethod).parameters
+            remembered = {name: value for name, value in remembered.items() if name not in cem}
+        device = next((parameter.device for parameter in self.parameters()), torch.device("cpu"))
+        own = {} if hasattr(self.dynamics, "latent_dim") else {"latent_dim": self.architecture.latent_dim}
+        model = LatentEnv(self.dynamics, self.constraint, self.goal, action_spec=spec, device=device, **own)
+        policy = LS3Planner(
+            model, self.value, self.safe_set, self.encoder, optimizer=optimizer, **(remembered | settings)
+        )
+        # Only what made a planner is remembered.
+        self.action_spec, self.planner_settings = spec, self.planner_settings | settings
+        return policy
 
     def save(self, path: str | Path) -> Path:
         """Write weights and all that the agent was made for to one file; a half-written file never takes its place."""
@@ -250,7 +277,7 @@ class LS3Agent(nn.Module):
             "architecture": dataclasses.asdict(self.architecture),
             "foreign": list(self.foreign),
             "action_spec": None if spec is None else {"low": spec.space.low.cpu(), "high": spec.space.high.cpu()},
-            "planner": {name: _plain(value) for name, value in self.planner_settings.items()},
+            "planner": {name: _storable(name, value) for name, value in self.planner_settings.items()},
             "task": self.task,
             "versions": _versions(),
             "state_dict": self.state_dict(),
@@ -286,17 +313,27 @@ class LS3Agent(nn.Module):
             )
         _check_shape(path, content["architecture"], expected)
         bounds = content.get("action_spec")
+        spec = None
+        if bounds is not None:
+            spec = Bounded(**bounds, shape=bounds["low"].shape, dtype=bounds["low"].dtype)
         agent = cls(
             **content["architecture"],
             **given,
-            action_spec=None if bounds is None else Bounded(**bounds, shape=bounds["low"].shape),
+            action_spec=spec,
             planner=content.get("planner"),
             task=content.get("task"),
-        ).to(device)
+        )
+        weights = content["state_dict"]
+        dtypes = {weight.dtype for weight in weights.values() if weight.is_floating_point()}
+        agent.to(device=device, dtype=dtypes.pop() if len(dtypes) == 1 else None)
         try:
-            agent.load_state_dict(content["state_dict"])
+            agent.load_state_dict(weights)
         except RuntimeError as error:
-            raise ValueError(f"{path} does not fit its own architecture; the file is damaged: {error}") from error
+            which = f"the modules that were given ({', '.join(given)}) or " if given else ""
+            raise ValueError(
+                f"The weights in {path} do not fit {which}the file's own architecture: {error}. Give modules of the "
+                "shapes that were saved; if they are, the file is damaged."
+            ) from error
         return agent
 
 

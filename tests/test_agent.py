@@ -6,7 +6,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded
 
 from ls3_torchrl import LS3Agent
-from ls3_torchrl.planners import LS3Planner
+from ls3_torchrl.planners import CrossEntropyMethod, LS3Planner
 
 TINY = {
     "latent_dim": 4,
@@ -142,7 +142,7 @@ def test_text_files_are_refused(tmp_path):
 def test_weights_that_do_not_fit_are_refused(tmp_path):
     path = tiny().save(tmp_path / "agent.pt")
     change(path, state_dict=tiny(value_hidden=(9,)).state_dict())
-    with pytest.raises(ValueError, match="does not fit its own architecture"):
+    with pytest.raises(ValueError, match="do not fit the file's own architecture"):
         LS3Agent.load(path)
 
 
@@ -318,3 +318,88 @@ def test_every_module_can_be_given():
 def test_unknown_settings_of_the_architecture_are_refused():
     with pytest.raises(TypeError, match="latent_size"):
         LS3Agent(2, latent_size=3)
+
+
+@pytest.mark.parametrize("wrong", [{"horizon": 0}, {"horizn": 3}])
+def test_settings_that_were_refused_are_not_remembered(tmp_path, wrong):
+    agent = tiny()
+    with pytest.raises((ValueError, TypeError), match="horiz"):
+        agent.planner(SPEC, **OPTIONS, **wrong) if "horizn" in wrong else agent.planner(SPEC, **(OPTIONS | wrong))
+    assert agent.action_spec is None
+    agent.planner(SPEC, **OPTIONS)
+    assert LS3Agent.load(agent.save(tmp_path / "agent.pt")).planner().horizon == OPTIONS["horizon"]
+
+
+class Shooting(CrossEntropyMethod):
+    """Another optimiser: one round of candidates."""
+
+    def __init__(self):
+        super().__init__(num_candidates=6, num_elites=1, optim_steps=1)
+
+
+def test_another_optimiser_takes_the_place_of_cem_and_is_not_remembered(tmp_path):
+    agent = tiny()
+    agent.planner(SPEC, **OPTIONS)
+    planner = agent.planner(optimizer=Shooting(), horizon=3)
+    assert isinstance(planner.optimizer, Shooting)
+    assert planner.horizon == 3
+    loaded = LS3Agent.load(agent.save(tmp_path / "agent.pt"))
+    assert loaded.planner().optimizer.num_candidates == OPTIONS["num_candidates"]
+    assert isinstance(loaded.planner(optimizer=Shooting()).optimizer, Shooting)
+
+
+def test_a_setting_that_a_file_cannot_keep_is_named_before_anything_is_written(tmp_path):
+    agent = tiny()
+    agent.planner_settings["horizon"] = object()
+    with pytest.raises(ValueError, match="setting horizon holds a object"):
+        agent.save(tmp_path / "agent.pt")
+    assert not (tmp_path / "agent.pt").exists()
+
+
+def test_precision_travels_with_the_file(tmp_path):
+    agent = tiny().double()
+    agent.planner(SPEC.to(torch.float64), **OPTIONS)
+    loaded = LS3Agent.load(agent.save(tmp_path / "agent.pt"))
+    assert all(p.dtype == torch.float64 for p in loaded.parameters())
+    planner = loaded.planner()
+    assert planner.action_spec.dtype == torch.float64
+    assert acts(planner).dtype == torch.float64
+
+
+class Drift(torch.nn.Module):
+    """Dynamics of one's own, which do not say how large their latents are."""
+
+    def forward(self, latent, action):
+        return latent + action.sum(-1, keepdim=True)
+
+
+def test_dynamics_of_ones_own_plan_in_an_agent_without_any_parameter():
+    def module(function, written):
+        return TensorDictModule(function, ["latent"], [written])
+
+    agent = LS3Agent(
+        2,
+        latent_dim=4,
+        encoder=TensorDictModule(lambda x: x, ["sensors"], ["latent"]),
+        dynamics=TensorDictModule(Drift(), ["latent", "action"], [("next", "latent")]),
+        value=module(lambda z: z[..., :1], "state_value"),
+        safe_set=module(lambda z: 0 * z[..., :1] + 5, "safe_set_logit"),
+        constraint=module(lambda z: 0 * z[..., :1] - 5, "constraint_logit"),
+        goal=module(lambda z: 0 * z[..., :1] - 5, "goal_logit"),
+    )
+    assert not list(agent.parameters())
+    planner = agent.planner(SPEC, **(OPTIONS | {"num_candidates": 200, "optim_steps": 4}))
+    action = planner(TensorDict({"sensors": torch.zeros(3, 4)}, [3]))["action"]
+    assert (action.sum(-1) > 1.5).all()  # the value rises with the sum of the actions, at most 2
+
+
+def test_modules_that_do_not_fit_the_file_are_named(tmp_path):
+    path = tiny(encoder=reader()).save(tmp_path / "agent.pt")
+    other = TensorDictModule(torch.nn.Linear(11, 4), ["sensors"], ["latent"])
+    with pytest.raises(ValueError, match=r"do not fit the modules that were given \(encoder\)"):
+        LS3Agent.load(path, modules={"encoder": other})
+
+
+def test_an_action_without_dimension_is_refused():
+    with pytest.raises(ValueError, match=r"Give a single action as shape \[1\]"):
+        LS3Agent(action_spec=Bounded(low=-1.0, high=1.0, shape=()))

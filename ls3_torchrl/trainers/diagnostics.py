@@ -114,6 +114,7 @@ class StateProbe:
         latent = self.encode(episodes[self.keys.observation][:, starts].flatten(0, 1)).to(device)
         for step in range(horizon):
             action = episodes[self.keys.action][:, starts + step].flatten(0, 1).to(device)
-            latent = dynamics.distribution(latent, action)[0].mean(-2)
+            predicted = dynamics.distribution(latent, action)[0]
+            latent = predicted.mean(-2) if predicted.ndim > latent.ndim else predicted
         reached = episodes[unravel_key(("next", self.state_key))][:, starts + horizon - 1].flatten(0, 1).cpu()
         return float((self.read(latent.cpu()) - reached).norm(dim=-1).mean())

@@ -116,15 +116,16 @@ class Learner:
         self.lr, self.cooldown = lr, cooldown
         self.logger, self.progress = logger, progress
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True)
+        #: ``None`` where there is nothing to train: a constraint that is known, a goal estimator that is frozen.
+        self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True) if self.parameters else None
         self.target_interval, self.tau = target_interval, tau
         self.target: HardUpdate | SoftUpdate | None = None
         self.steps = 0
 
     def compute_loss(self) -> tuple[TensorDictBase, Tensor]:
         """What the losses write for a new batch, and the sum that is minimised."""
-        rows = self.sample()
-        second = None if self.auxiliary is None else self.auxiliary.sample()
+        rows = self._as_parameters(self.sample())
+        second = None if self.auxiliary is None else self._as_parameters(self.auxiliary.sample())
         with torch.autocast(self.parameters[0].device.type, torch.bfloat16, enabled=self.bf16):
             losses = self.loss(rows)
             value = torch.stack([losses[f"loss_{name}"] for name in self.names]).sum()
@@ -134,8 +135,20 @@ class Learner:
                 value = value + self.auxiliary.weight * auxiliary
         return losses, value
 
+    def _as_parameters(self, rows: TensorDictBase) -> TensorDictBase:
+        """A batch where the parameters are, in their precision."""
+        device, dtype = self.parameters[0].device, self.parameters[0].dtype
+        if device.type != "cpu":
+            rows = rows.to(device)
+        if dtype != torch.float32:  # in which buffers keep what they hold
+            rows = rows.apply(lambda entry: entry.to(dtype) if entry.is_floating_point() else entry)
+        return rows
+
     def train(self, steps: int, phase: str) -> None:
-        """Take ``steps`` gradient steps, which are logged and shown as ``phase``."""
+        """Take ``steps`` gradient steps, which are logged and shown as ``phase``; none where nothing can be trained."""
+        if self.optimizer is None:
+            return
+        self._require_one_precision()
         self._make_target()
         # Networks of this size lose more by waking a second core than they gain by it.
         with threads(1), progress_bar(steps, phase, enabled=self.progress) as bar:
@@ -147,6 +160,19 @@ class Learner:
                     self._log(phase, losses)
                     bar.set_postfix_str(f"loss {value.item():.4g}", refresh=False)
                 bar.update()
+
+    def _require_one_precision(self) -> None:
+        kinds = {
+            (parameter.device, parameter.dtype)
+            for name, parameter in [*self.loss.named_parameters(), *self.loss.named_buffers()]
+            if "target_" in name or parameter.requires_grad
+            if parameter.is_floating_point()
+        }
+        if len(kinds) > 1:
+            raise RuntimeError(
+                f"{self.names[0]}: network and lagged network differ in device or dtype: {sorted(map(str, kinds))}. "
+                "Move or cast the agent before its trainer is made."
+            )
 
     def _make_target(self) -> None:
         """Make what moves the lagged network, at the first step and not before.
@@ -163,6 +189,7 @@ class Learner:
             self.target = HardUpdate(self.loss, value_network_update_interval=self.target_interval - 1)
 
     def _step(self) -> tuple[TensorDictBase, Tensor]:
+        assert self.optimizer is not None
         losses, value = self.compute_loss()
         self.optimizer.zero_grad()
         value.backward()
@@ -186,7 +213,7 @@ class Learner:
         """Networks, lagged networks, optimiser and counters."""
         return {
             "loss": self.loss.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": None if self.optimizer is None else self.optimizer.state_dict(),
             "steps": self.steps,
             "has_target": self.target is not None,
             "target_counter": getattr(self.target, "counter", 0),
@@ -200,5 +227,6 @@ class Learner:
             if isinstance(self.target, HardUpdate):
                 self.target.counter = state_dict["target_counter"]
         self.loss.load_state_dict(state_dict["loss"])
-        self.optimizer.load_state_dict(state_dict["optimizer"])
+        if self.optimizer is not None:
+            self.optimizer.load_state_dict(state_dict["optimizer"])
         self.steps = state_dict["steps"]

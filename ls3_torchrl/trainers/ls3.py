@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -75,10 +76,11 @@ class LS3Trainer:
         self.agent, self.buffer = agent, buffer
         self.options = options = LS3Options() if options is None else options
         self.episode_length = episode_length
+        self._failure_value: float | None = None  # made when it is first needed, once a phase
         if options.loss.monte_carlo and not buffer.continue_failures:
             raise ValueError(
-                "loss.monte_carlo needs a buffer with continue_failures=True: otherwise a failure's return ends with "
-                "the episode and is no lower bound."
+                "LossOptions.monte_carlo needs a buffer with continue_failures=True: otherwise a failure's return "
+                "ends with the episode and is no lower bound."
             )
         optim = options.optim
         self._how: dict[str, Any] = {
@@ -87,6 +89,7 @@ class LS3Trainer:
             "logger": logger,
             "progress": progress,
         }
+        self._everything = RowSelection(online_fraction=options.online.fraction)
         self.dynamics = self._dynamics_learner()
         self.value, self.value_td = self._value_learner(), self._value_td_learner()
         self.safe_set = self._safe_set_learner()
@@ -107,9 +110,12 @@ class LS3Trainer:
 
     def _sampler(self, members: int | None = None, **rows: Any) -> Callable[[], TensorDictBase]:
         """Draws batches from the ``rows`` that a :class:`~ls3_torchrl.data.RowSelection` describes."""
-        batch_size = self.options.optim.batch_size
         selection = RowSelection(online_fraction=self.options.online.fraction, **rows)
-        return lambda: self.buffer.sample(batch_size, selection, members=members)
+        # Of bound methods: a copy of the trainer draws from its own buffer, and can be pickled.
+        return partial(self._sample, selection, members)
+
+    def _sample(self, selection: RowSelection, members: int | None) -> TensorDictBase:
+        return self.buffer.sample(self.options.optim.batch_size, selection, members=members)
 
     def _dynamics_learner(self) -> Learner:
         """Equation (2)."""
@@ -123,7 +129,7 @@ class LS3Trainer:
         return Learner("dynamics", loss, sample, lr=options.optim.dynamics_lr, **self._how)
 
     def _value_learner(self) -> Learner:
-        """Equation (3), with the value of failure beside it where it is asked for."""
+        """Equation (3), and the value of failure where it is asked for."""
         options, value = self.options, self.agent.value
         members = self._members(value)
         bootstrap = members is not None
@@ -154,12 +160,12 @@ class LS3Trainer:
 
     def _safe_set_learner(self) -> Learner:
         """Equation (5)."""
-        options, sample = self.options, self._sampler()
+        options = self.options
         loss = SafeSetLoss(self.agent.safe_set, gamma=options.loss.gamma_safe_set)
         return Learner(
             "safe_set",
             loss,
-            lambda: self._weigh(sample()),
+            self._sample_weighed,
             lr=options.optim.lr,
             target_interval=options.optim.target_interval,
             **self._how,
@@ -170,7 +176,7 @@ class LS3Trainer:
         loss.set_keys(label=label)  # under the buffer's keys, which need not be the classifier's
         return Learner(name, loss, self._sampler(), lr=self.options.optim.lr, **self._how)
 
-    def _failure_value(self) -> float:
+    def _make_failure_value(self) -> float:
         """What failing for a whole episode returns, −(1 − γ^T) / (1 − γ), unless another value was asked for."""
         value, gamma = self.options.loss.failure_value, self.buffer.gamma
         if value is not None:
@@ -191,10 +197,13 @@ class LS3Trainer:
                 rows = rows[found[torch.arange(count, device=found.device) % len(found)]]
                 rows.set("latent", rows["next", "latent"])
         rows = rows if members is None else rows.reshape(-1, members)
-        return rows.set("reward_to_go", torch.full_like(rows["reward_to_go"], self._failure_value()))
+        if self._failure_value is None:
+            self._failure_value = self._make_failure_value()
+        return rows.set("reward_to_go", torch.full_like(rows["reward_to_go"], self._failure_value))
 
-    def _weigh(self, rows: TensorDictBase) -> TensorDictBase:
-        """The rows for equation (5); how much online episodes that timed out count is an option."""
+    def _sample_weighed(self) -> TensorDictBase:
+        """Rows for equation (5); how much online episodes that timed out count is an option."""
+        rows = self._sample(self._everything, None)
         weight = self.options.loss.timed_out_weight
         if weight != 1.0:
             timed_out = rows["timed_out"] & (rows["tag"] == int(Tag.ONLINE))
@@ -204,6 +213,7 @@ class LS3Trainer:
     def train_offline(self) -> None:
         """Train the latent models on the offline data (equations (2), (3), (4), (5) and the classifiers)."""
         steps = self.options.offline
+        self._failure_value = None
         self.dynamics.train(steps.dynamics_steps, "Dynamics")
         self.value.train(steps.value_steps, "Value, reward-to-go")
         self.value_td.train(steps.value_td_steps, "Value, TD-1")

@@ -112,9 +112,9 @@ class OfflineOptions:
 
     Args:
         dynamics_steps: of equation (2).
+        classifier_steps: of each of safe set (equation (5)), constraint and goal.
         value_steps: of equation (3), on the returns that were seen.
         value_td_steps: of equation (4).
-        classifier_steps: of each of safe set (equation (5)), constraint and goal.
     """
 
     dynamics_steps: int = 10_000

@@ -21,7 +21,7 @@ from ls3_torchrl.trainers.progress import progress_bar
 
 _log = logging.getLogger(__name__)
 PHASE = "VAE"
-#: Squared error, as a fraction of the images' variance, above which a VAE hardly sees what moves.
+#: Squared error, as a fraction of the images' variance, above which a VAE knows little more than the mean image.
 _COLLAPSED = 0.6
 
 
@@ -79,7 +79,14 @@ class VAETrainer:
                 "VAETrainer needs an agent with an encoder and a decoder. An encoder that is trained already needs no "
                 "VAETrainer: call buffer.encode(agent.encoder)."
             )
+        rescales = all(hasattr(half, "rescale") for half in (agent.encoder, agent.decoder))
+        if options.unit_scale and not rescales:
+            raise ValueError(
+                "unit_scale needs an encoder and a decoder with a method rescale(factor), as PixelEncoder and "
+                "PixelDecoder have. Pass unit_scale=False for others."
+            )
         self.steps = 0
+        self._finished = False
         for half in (agent.encoder, agent.decoder):
             half.to(memory_format=torch.channels_last)
         self.loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta, reduction=options.reduction)
@@ -105,15 +112,17 @@ class VAETrainer:
         if self.options.checkpoint is not None:
             self._take_checkpoint(self.options.checkpoint)
             return
-        self._minimise()
+        if self.steps < self.options.steps:
+            self._minimise()
         for half in (self.agent.encoder, self.agent.decoder):
             half.requires_grad_(False)
         self.encode()
-        if self.options.unit_scale:
+        if self.options.unit_scale and not self._finished:
             spread = float(self.buffer.transitions.storage[:]["loc"].std(0).square().mean().sqrt())
             self.agent.encoder.rescale(1.0 / spread)
             self.agent.decoder.rescale(1.0 / spread)
             self.encode()
+        self._finished = True
 
     def encode(self) -> None:
         """Encode every frame of the buffer."""
@@ -133,7 +142,7 @@ class VAETrainer:
 
     def _minimise(self) -> None:
         options = self.options
-        if self.steps == 0 and self.agent.decoder.background is not None:
+        if self.steps == 0 and getattr(self.agent.decoder, "background", None) is not None:
             self.agent.decoder.set_background(self.buffer.mean_frame())
         with (
             threads(options.threads),
@@ -197,7 +206,7 @@ class VAETrainer:
     def _log(self, losses: TensorDictBase) -> dict[str, float]:
         scalars = {key: item.item() for key, item in losses.items()}
         if not all(map(math.isfinite, scalars.values())):
-            raise FloatingPointError(f"The VAE diverged: {scalars} at step {self.steps}. Lower vae.lr.")
+            raise FloatingPointError(f"The VAE diverged: {scalars} at step {self.steps}. Lower VAEOptions.lr.")
         log_scalars(self.logger, PHASE, self.steps, scalars)
         return scalars
 
@@ -207,8 +216,8 @@ class VAETrainer:
         variance = float((images - images.mean(0)).square().mean())
         if error > _COLLAPSED * variance:
             _log.warning(
-                "The VAE hardly sees what moves: its squared error is %.1e, that of the mean image %.1e. Try more "
-                "steps, a higher learning rate, or a later warmup.",
+                "The VAE reconstructs little more than the mean image: its squared error is %.1e, that of the mean "
+                "image %.1e. Try more steps, a higher learning rate, or a later warmup.",
                 error,
                 variance,
             )
@@ -221,6 +230,7 @@ class VAETrainer:
             "optimizer": self.optimizer.state_dict(),
             "schedule": self.schedule.state_dict(),
             "steps": self.steps,
+            "finished": self._finished,
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -229,4 +239,4 @@ class VAETrainer:
         self.agent.dynamics.load_state_dict(state_dict["dynamics"])
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.schedule.load_state_dict(state_dict["schedule"])
-        self.steps = state_dict["steps"]
+        self.steps, self._finished = state_dict["steps"], state_dict["finished"]

@@ -64,6 +64,19 @@ def test_imagined_ends_are_compared_with_where_the_actions_led(gain):
     assert error < 3.0 if gain else error == pytest.approx(moved, abs=2.0)
 
 
+def test_dynamics_without_members_are_compared_alike():
+    class Lone(Mover):
+        def distribution(self, latent, action):
+            return tuple(value[:, 0] for value in super().distribution(latent, action))
+
+    episodes = walks(6)
+    errors = []
+    for dynamics in (Mover(1.0), Lone(1.0)):
+        agent = LS3Agent(action_dim=2, latent_dim=2, encoder=encoder(False), dynamics=dynamics)
+        errors.append(StateProbe(agent, [episodes], progress=False).imagination_error(episodes, horizon=3))
+    assert errors[0] == pytest.approx(errors[1], rel=1e-3)
+
+
 def test_without_states_there_is_nothing_to_probe():
     episodes = TensorDict({"pixels": torch.zeros(2, 3, 3, 64, 64, dtype=torch.uint8)}, [2, 3])
     with pytest.raises(KeyError, match="state"):

@@ -1,5 +1,8 @@
 """LS³'s learners: which data each draws, what the options change, and that training continues where it stopped."""
 
+import copy
+import pickle
+
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
@@ -239,3 +242,49 @@ def test_a_value_function_without_members_trains_too(make_agent, filled):
     options = LS3Options(OfflineOptions(2, 2, 2, 2), optim=OPTIM, loss=LossOptions(failure_weight=0.5))
     LS3Trainer(agent, filled(agent), options, progress=False).train_offline()
     assert not torch.equal(value.module.layer.weight, before)
+
+
+def test_an_agent_in_double_precision_trains_on_what_the_buffer_holds(make_agent, filled):
+    agent = make_agent()
+    buffer = filled(agent)
+    agent.double()
+    options = LS3Options(OfflineOptions(2, 2, 2, 2), optim=OPTIM, loss=LossOptions(failure_weight=0.5))
+    trainer = LS3Trainer(agent, buffer, options, progress=False)
+    trainer.train_offline()
+    assert all(p.dtype == torch.float64 for p in agent.parameters())
+
+
+def test_an_agent_that_is_cast_behind_its_trainers_back_is_noticed(make_agent, filled):
+    agent = make_agent()
+    trainer = trainer_of(agent, filled(agent))
+    agent.double()
+    with pytest.raises(RuntimeError, match=r"before its trainer is made"):
+        trainer.value_td.train(1, "Value, TD-1")
+
+
+def test_a_constraint_that_is_known_and_a_goal_that_is_frozen_need_no_training(make_agent, filled, tmp_path):
+    known = TensorDictModule(lambda latent: 10.0 * (latent[..., :1] - 1.0), ["latent"], ["constraint_logit"])
+    agent = make_agent(constraint=known)
+    agent.goal.requires_grad_(False)
+    goal = [p.clone() for p in agent.goal.parameters()]
+    trainer = trainer_of(agent, filled(agent), offline=OfflineOptions(2, 2, 2, 2))
+    trainer.train_offline()
+    assert (trainer.constraint.steps, trainer.goal.steps, trainer.safe_set.steps) == (0, 0, 2)
+    assert all(torch.equal(a, b) for a, b in zip(goal, agent.goal.parameters(), strict=True))
+    trainer.load_state_dict(trainer.state_dict())
+
+
+def test_a_copy_of_a_trainer_draws_from_a_buffer_of_its_own(make_agent, filled):
+    agent = make_agent()
+    buffer = filled(agent)
+    trainer = trainer_of(agent, buffer, loss=LossOptions(failure_weight=0.5))
+    for other in (copy.deepcopy(trainer), pickle.loads(pickle.dumps(trainer))):
+        assert other.buffer is not buffer
+        buffer.sample = other.buffer.sample = None  # whoever draws from it says so
+        for name in LEARNERS:
+            with pytest.raises(TypeError):
+                other.learners[name].sample()
+        del buffer.sample
+        for name in LEARNERS:
+            with pytest.raises(TypeError):
+                other.learners[name].sample()

@@ -112,7 +112,7 @@ def test_a_vae_that_draws_the_mean_image_is_noticed(make_agent, filled, episode,
     content["pixels"][1::2], content["next", "pixels"][::2] = 255, 255
     trainer = VAETrainer(make_agent(), filled(content), VAEOptions(**FAST), progress=False)
     trainer._warn_of_collapse(0.25 * error)
-    assert ("hardly sees" in caplog.text) == warned
+    assert ("little more than the mean image" in caplog.text) == warned
 
 
 def test_a_vae_can_be_taken_from_a_trained_agent_of_the_same_shape(make_agent, filled, episode, recorder, tmp_path):
@@ -153,6 +153,45 @@ def test_training_that_continues_from_its_state_ends_as_one_that_was_never_stopp
     for half in ("encoder", "decoder", "dynamics"):
         pairs = zip(getattr(whole.agent, half).parameters(), getattr(second.agent, half).parameters(), strict=True)
         assert all(torch.equal(a, b) for a, b in pairs), half
+
+
+def test_training_again_once_it_has_ended_changes_nothing(make_agent, filled, episode):
+    content = episode(7)
+
+    def trainer(seed):
+        torch.manual_seed(seed)
+        return VAETrainer(make_agent(), filled(content), VAEOptions(**FAST, unit_scale=True), progress=False)
+
+    first, second = trainer(0), trainer(1)
+    first.train()
+    weights = [p.clone() for p in first.agent.encoder.parameters()]
+    first.train()
+    second.load_state_dict(first.state_dict())
+    second.train()
+    for agent in (first.agent, second.agent):
+        assert all(torch.equal(a, b) for a, b in zip(weights, agent.encoder.parameters(), strict=True))
+    assert torch.equal(second.buffer.transitions.storage[:]["loc"], first.buffer.transitions.storage[:]["loc"])
+
+
+class Brush(torch.nn.Module):
+    """A decoder of one's own."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(8, 3 * 64 * 64)
+
+    def forward(self, latent):
+        return self.layer(latent).unflatten(-1, (3, 64, 64))
+
+
+def test_a_decoder_of_ones_own_is_trained_too(make_agent, filled):
+    decoder = TensorDictModule(Brush(), ["latent"], ["reco_pixels"])
+    agent = make_agent(decoder=decoder)
+    before = decoder.module.layer.weight.detach().clone()
+    VAETrainer(agent, filled(), VAEOptions(**FAST), progress=False).train()
+    assert not torch.equal(before, decoder.module.layer.weight)
+    with pytest.raises(ValueError, match=r"unit_scale needs .* rescale"):
+        VAETrainer(agent, filled(), VAEOptions(**FAST, unit_scale=True), progress=False)
 
 
 def test_images_under_a_key_of_ones_own(make_agent, episode, recorder):
