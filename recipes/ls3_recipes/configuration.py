@@ -102,7 +102,7 @@ def refuse_irrelevant(overrides: Iterable[str], settings: type, who: str) -> Non
     for override in overrides:
         own: Any = defaults(settings)
         elsewhere: Any = known
-        path = override.partition("=")[0].lstrip("+~").split(".")
+        path = _name_in(override).split(".")
         for depth, key in enumerate(path):
             if not isinstance(own, Mapping) or "@" in key:
                 break
@@ -114,15 +114,41 @@ def refuse_irrelevant(overrides: Iterable[str], settings: type, who: str) -> Non
             elsewhere = elsewhere.get(key) if isinstance(elsewhere, Mapping) else None
 
 
-def settings_from(config: DictConfig, settings: type[S]) -> S:
-    """The settings of a composed configuration.
+def refuse_unread(overrides: Iterable[str], settings: Any) -> None:
+    """Refuse arguments of the command line that set what nothing reads, with the other settings as they are.
 
     Raises:
-        ValueError: for unknown and bad settings, by their full names.
+        ValueError: naming the setting that would make them matter.
+    """
+    unread = settings.unread if isinstance(settings, RunSettings) else {}
+    for override in overrides:
+        name = _name_in(override)
+        for section, remedy in unread.items():
+            if f"{name}.".startswith(f"{section}."):
+                raise ValueError(f"{override}: {section} only matters with {remedy}. Add that, or leave {name} out.")
+
+
+def _name_in(override: str) -> str:
+    """The setting that an argument of the command line sets."""
+    return override.partition("=")[0].lstrip("+~")
+
+
+def settings_from(config: DictConfig, settings: type[S], overrides: Sequence[str] = ()) -> S:
+    """The settings of a composed configuration.
+
+    Args:
+        config: what Hydra composed.
+        settings: their class.
+        overrides: the arguments of the command line among them.
+
+    Raises:
+        ValueError: for unknown and bad settings, by their full names, and for arguments that set what nothing reads.
     """
     values = OmegaConf.to_container(config, resolve=True)
     assert isinstance(values, dict)
-    return build(settings, prune({str(key): value for key, value in values.items()}, settings))
+    built = build(settings, prune({str(key): value for key, value in values.items()}, settings))
+    refuse_unread(overrides, built)
+    return built
 
 
 def settings_of_run(folder: str | Path) -> RunSettings:
@@ -155,7 +181,7 @@ def compose_settings(command: str, settings: type[S], overrides: Sequence[str] =
     overrides = rename_overrides(overrides)
     refuse_irrelevant(overrides, settings, _who(command, overrides))
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return settings_from(compose(command, overrides), settings)
+        return settings_from(compose(command, overrides), settings, overrides)
 
 
 def train_settings(*overrides: str) -> RunSettings:
@@ -209,7 +235,7 @@ def run_command(
 
     def under_hydra(config: DictConfig) -> None:
         try:
-            chosen = settings_from(config, settings)
+            chosen = settings_from(config, settings, overrides)
         except ValueError as error:
             raise SystemExit(f"ls3 {command}: {error}") from None
         job(chosen)

@@ -127,9 +127,11 @@ class RunSettings:
         threads: intra-op threads; ``None`` leaves PyTorch's choice.
         pictures: leave pictures in the run's folder.
         task: what is learnt.
-        agent: sizes of the networks.
+        agent: sizes of the networks. To a baseline that reads latents, all of them matter: it makes the whole agent, so
+            that with the same seed it draws the same random numbers, and the VAE is LS³'s bit for bit.
         vae: equation (1).
-        buffer: what is kept of episodes.
+        buffer: what is kept of episodes; ``dynamics_after_violation`` matters to a baseline by the prediction term of
+            the VAE alone.
         online: how many episodes.
         evaluation: in how many episodes the agent is evaluated.
     """
@@ -149,3 +151,8 @@ class RunSettings:
     buffer: BufferSettings  # type: ignore[valid-type]
     online: EpisodeSettings
     evaluation: EvaluationSettings
+
+    @property
+    def unread(self) -> dict[str, str]:
+        """Sections that nothing reads as the settings are, and the setting that would change that."""
+        return {}

@@ -1,5 +1,6 @@
 """What tasks, presets and arguments resolve to, and what is refused."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -202,6 +203,28 @@ def test_unknown_names_are_refused_with_what_there_is(override, error, message):
 def test_settings_that_only_other_algorithms_have_are_refused(algorithm, override, message):
     with pytest.raises(ValueError, match=message):
         train_settings(f"algorithm={algorithm}", "preset=cpu", override)
+
+
+@pytest.mark.parametrize(
+    ("others", "override", "remedy"),
+    [
+        (["algorithm=bc", "encoder=conv"], "vae.steps=5", "vae only matters with encoder=latents"),
+        (["algorithm=awac", "encoder=conv"], "agent.num_dynamics=9", "agent only matters with encoder=latents"),
+        (["algorithm=sacfd", "encoder=conv"], "++vae.steps=5", "vae only matters with encoder=latents"),
+        (["algorithm=sacfd"], "policy.risk.gamma=0.5", "policy.risk only matters with recovery=true"),
+    ],
+)
+def test_arguments_that_nothing_reads_are_refused_with_what_makes_them_matter(others, override, remedy):
+    with pytest.raises(ValueError, match=re.escape(f"{override}: {remedy}. Add that, or leave ")):
+        train_settings("preset=smoke", *others, override)
+    train_settings("preset=smoke", *others)  # what files bring is left unread
+    train_settings("preset=smoke", others[0], remedy.split()[-1], override)
+
+
+def test_what_matters_to_the_vae_of_a_baseline_can_be_set():
+    overrides = ("vae.steps=5", "agent.num_dynamics=9", "buffer.dynamics_after_violation=false")
+    settings = as_dict(train_settings("algorithm=bc", "preset=smoke", *overrides))
+    assert (settings["vae"]["steps"], settings["agent"]["num_dynamics"]) == (5, 9)
 
 
 def test_files_bring_the_settings_of_all_algorithms_and_each_is_left_its_own():

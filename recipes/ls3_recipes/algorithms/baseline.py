@@ -93,7 +93,7 @@ class BaselineSettings(RunSettings):
 
     Args:
         encoder: ``"latents"``, the means of the VAE that LS³ trains, frozen; or ``"conv"``, convolutions of each
-            network's own.
+            network's own, with which nothing reads ``agent`` and ``vae``.
         policy: of the actor and, where it has them, its critics.
     """
 
@@ -103,6 +103,11 @@ class BaselineSettings(RunSettings):
     def __post_init__(self) -> None:
         """Refuse unknown encoders."""
         one_of(self.encoder, ("latents", "conv"), "encoder")
+
+    @property
+    def unread(self) -> dict[str, str]:
+        """Without the VAE, neither its training nor the networks that are made with it."""
+        return dict.fromkeys(("agent", "vae"), "encoder=latents") if self.encoder == "conv" else {}
 
 
 class Baseline(Algorithm):

@@ -53,7 +53,7 @@ class SACfDPolicySettings(ActorCriticSettings):
     Args:
         alpha: weight of the entropy, for rewards of -1 a step; above 0.
         learn_alpha: whether it is learnt.
-        risk: of the safety critic.
+        risk: of the safety critic, which there is with recovery alone.
     """
 
     alpha: float = 0.02
@@ -82,6 +82,11 @@ class SACfDSettings(BaselineSettings):
         super().__post_init__()
         if not isinstance(self.recovery, bool):
             raise ValueError(f"recovery must be true or false, got {self.recovery!r}.")
+
+    @property
+    def unread(self) -> dict[str, str]:
+        """Without recovery, nothing of the safety critic."""
+        return super().unread | ({} if self.recovery else {"policy.risk": "recovery=true"})
 
 
 class SACfD(ActorCritic):
