@@ -90,7 +90,7 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
 
     Raises:
         ValueError: for a name that the dataclass lacks, one that it needs, or (from its own checks) a bad value;
-            always with the section before the name.
+            always with the section before the name. Also for a value in place of a section.
 
     Example:
         >>> Flight = from_signatures("Flight", "How to fly.", lambda *, speed=3.0: None)
@@ -109,6 +109,8 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
     arguments: dict[str, Any] = {}
     for key, value in values.items():
         if key in nested:
+            if value is not None and not isinstance(value, Mapping):
+                raise ValueError(f"{prefix}{key} is a section, got {value!r}: set {prefix}{key}.KEY=VALUE.")
             arguments[key] = build(nested[key], value or {}, prefix + key)
         elif value != MISSING:
             arguments[key] = _tuples(value)
