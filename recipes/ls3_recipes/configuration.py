@@ -16,16 +16,12 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from ls3_recipes.algorithms import ALGORITHMS
+from ls3_recipes.arguments import config_dir, name_in, split_arguments
 from ls3_recipes.options import build, defaults
 from ls3_recipes.renamed import RENAMED, on_command_line, rename_overrides, rename_settings
 from ls3_recipes.run_settings import RunSettings
 
 CONF = Path(__file__).parent / "conf"
-#: Hydra's options that take the next argument as their value.
-WITH_VALUE = (
-    *("--cfg", "-c", "--package", "-p", "--experimental-rerun"),
-    *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
-)
 S = TypeVar("S")
 
 
@@ -110,7 +106,7 @@ def refuse_irrelevant(overrides: Iterable[str], settings: type, who: str) -> Non
     for override in overrides:
         own: Any = defaults(settings)
         elsewhere: Any = known
-        path = _name_in(override).split(".")
+        path = name_in(override).split(".")
         for depth, key in enumerate(path):
             if not isinstance(own, Mapping) or "@" in key:
                 break
@@ -122,6 +118,10 @@ def refuse_irrelevant(overrides: Iterable[str], settings: type, who: str) -> Non
             elsewhere = elsewhere.get(key) if isinstance(elsewhere, Mapping) else None
 
 
+def _named(values: Mapping[Any, Any]) -> dict[str, Any]:
+    return {str(key): value for key, value in values.items()}
+
+
 def refuse_unread(overrides: Iterable[str], settings: Any) -> None:
     """Refuse arguments of the command line that set what nothing reads, with the other settings as they are.
 
@@ -130,15 +130,10 @@ def refuse_unread(overrides: Iterable[str], settings: Any) -> None:
     """
     unread = settings.unread if isinstance(settings, RunSettings) else {}
     for override in overrides:
-        name = _name_in(override)
+        name = name_in(override)
         for section, remedy in unread.items():
             if f"{name}.".startswith(f"{section}."):
                 raise ValueError(f"{override}: {section} only matters with {remedy}. Add that, or leave {name} out.")
-
-
-def _name_in(override: str) -> str:
-    """The setting that an argument of the command line sets."""
-    return override.partition("=")[0].lstrip("+~")
 
 
 def settings_from(
@@ -157,7 +152,7 @@ def settings_from(
     """
     values = OmegaConf.to_container(config, resolve=True)
     assert isinstance(values, dict)
-    named = rename_settings(values, renamed, explicit={_name_in(override) for override in overrides})
+    named = rename_settings(_named(values), renamed, explicit={name_in(override) for override in overrides})
     built = build(settings, prune(named, settings))
     refuse_unread(overrides, built)
     return built
@@ -252,7 +247,7 @@ def run_command(
         with _errors_in_one_line(who):
             refuse_irrelevant(overrides, settings, _who(command, overrides))
             if {"-h", "--help"} & set(options):
-                print(help_of(command, settings, overrides, help_text, groups, folder=_config_dir(options)))
+                print(help_of(command, settings, overrides, help_text, groups, folder=config_dir(options)))
                 return
         sys.argv = [sys.argv[0], *overrides, *options]
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=command)(under_hydra)()
@@ -269,31 +264,6 @@ def _errors_in_one_line(who: str, output: Path | None = None) -> Iterator[None]:
         if begun or os.environ.get("HYDRA_FULL_ERROR") == "1":  # Hydra's own wish for the whole trace
             raise
         raise SystemExit(f"{who}: {' '.join(str(error).split())}") from None
-
-
-def split_arguments(arguments: Iterable[str]) -> tuple[list[str], list[str]]:
-    """Hydra's own options with their values, and the settings.
-
-    Example:
-        >>> split_arguments(["seed=1", "--config-dir", "mine", "preset=own", "--help"])
-        (['--config-dir', 'mine', '--help'], ['seed=1', 'preset=own'])
-    """
-    options: list[str] = []
-    overrides: list[str] = []
-    for argument in arguments:
-        last = options[-1] if options else ""
-        value = last in WITH_VALUE or (last in ("--info", "-i") and "=" not in argument)
-        (options if value or argument.startswith("-") else overrides).append(argument)
-    return options, overrides
-
-
-def _config_dir(options: Sequence[str]) -> str | None:
-    """The folder of a user's own files."""
-    for option, value in zip(options, [*options[1:], ""], strict=True):
-        name, equals, same = option.partition("=")
-        if name in ("--config-dir", "-cd"):
-            return same if equals else value
-    return None
 
 
 def help_of(
@@ -319,7 +289,7 @@ def help_of(
     with initialize_config_dir(str(CONF), version_base="1.3"):
         values = OmegaConf.to_container(compose(command, [*overrides, *searched]), resolve=False)
     assert isinstance(values, dict)
-    shown = prune(rename_settings(values, explicit={_name_in(override) for override in overrides}), settings)
+    shown = prune(rename_settings(_named(values), explicit={name_in(override) for override in overrides}), settings)
     choices = [f"  {group}: {', '.join(choices_of(group))}" for group in groups]
     heading = "All settings, with the values that these arguments give"
     settings_shown = OmegaConf.to_yaml(OmegaConf.create(shown))

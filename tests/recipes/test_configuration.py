@@ -51,7 +51,7 @@ TABLE_1 = {
     "loss.gamma_safe_set": 0.3,
 }
 
-# What the supplement's text says beside the table, and the counts of the original experiments.
+# What the supplement's text says in addition to the table, and the counts of the original experiments.
 TEXT = {
     "agent.dynamics_hidden": [128, 128],
     "agent.value_hidden": [256, 256, 256],
@@ -274,13 +274,13 @@ def test_a_file_with_a_setting_that_nobody_has_is_refused(setting, message):
         ("loss.monte_carlo=true", r"^loss\.monte_carlo needs buffer\.continue_failures=true"),
         ("online.updates=-1", r"^online\.updates"),
         ("online.episodes_per_update=0", r"^online\.episodes_per_update"),
-        ("online.select=first", r"^online\.select must be one of last, best; got 'first'"),
+        ("online.select=first", r"^online\.select must be one of 'last', 'best'; got 'first'"),
         ("online.fraction=1.0", r"^online\.fraction"),
         ("online.dynamics_steps=-1", r"^online\.dynamics_steps"),
         ("evaluation.episodes=0", r"^evaluation\.episodes"),
         ("task.horizon=0", r"^task\.horizon"),
         ("task.offline_episodes=0", r"^task\.offline_episodes"),
-        ("task.name=moon", r"^task\.name must be one of navigation, .*got 'moon'"),
+        ("task.name=moon", r"^task\.name must be one of 'navigation', .*got 'moon'"),
     ],
 )
 def test_impossible_settings_are_refused_by_their_full_names(override, message):

@@ -46,6 +46,13 @@ def test_fields_are_keyword_arguments_that_are_no_keys():
     }
 
 
+def test_all_arguments_but_some_can_be_taken():
+    flight = from_signatures("Flight", "How.", fly, without=("height_key", "in_keys"))
+    assert defaults(flight) == {"height": MISSING, "speed": 3.0}
+    with pytest.raises(ValueError, match="argument weight"):
+        from_signatures("Flight", "How.", fly, without=("weight",))
+
+
 def test_arguments_that_clash_or_are_not_there_are_noticed():
     with pytest.raises(ValueError, match="argument speed"):
         from_signatures("Flight", "How.", fly, fly)

@@ -106,9 +106,9 @@ def test_what_takes_long_is_timed_once():
     ("override", "message"),
     [
         ("presets=[]", "at least one preset, such as presets="),
-        ("domains=[moon]", r"domains must be one of navigation, .*got 'moon'"),
+        ("domains=[moon]", r"domains must be one of 'navigation', .*got 'moon'"),
         ("batches=[0]", "batches must be at least 1"),
-        ("seconds=0", "seconds must be positive"),
+        ("seconds=0", "seconds must be a finite number above 0"),
     ],
 )
 def test_what_cannot_be_timed_is_refused_before_anything_is(override, message):
