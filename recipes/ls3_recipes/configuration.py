@@ -118,7 +118,8 @@ def refuse_irrelevant(overrides: Iterable[str], settings: type, who: str) -> Non
             elsewhere = elsewhere.get(key) if isinstance(elsewhere, Mapping) else None
 
 
-def _named(values: Mapping[Any, Any]) -> dict[str, Any]:
+def _named(values: Any) -> dict[str, Any]:
+    assert isinstance(values, dict)
     return {str(key): value for key, value in values.items()}
 
 
@@ -151,7 +152,6 @@ def settings_from(
         ValueError: for unknown and bad settings, by their full names, and for arguments that set what nothing reads.
     """
     values = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(values, dict)
     named = rename_settings(_named(values), renamed, explicit={name_in(override) for override in overrides})
     built = build(settings, prune(named, settings))
     refuse_unread(overrides, built)
@@ -169,8 +169,7 @@ def settings_of_run(folder: str | Path) -> RunSettings:
     if not path.is_file():
         raise FileNotFoundError(f"{folder} is no run folder: config.yaml is missing. Pass run=DIR of a finished run.")
     values = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-    assert isinstance(values, dict)
-    renamed = rename_settings({"algorithm": "ls3"} | {str(key): value for key, value in values.items()})
+    renamed = rename_settings({"algorithm": "ls3"} | _named(values))
     if renamed["algorithm"] not in ALGORITHMS:
         raise ValueError(f"{path}: algorithm must be one of {', '.join(ALGORITHMS)}; got {renamed['algorithm']!r}.")
     settings = ALGORITHMS[renamed["algorithm"]].settings_class
@@ -288,7 +287,6 @@ def help_of(
     searched = [f"hydra.searchpath=[file://{Path(folder).absolute()}]"] if folder else []
     with initialize_config_dir(str(CONF), version_base="1.3"):
         values = OmegaConf.to_container(compose(command, [*overrides, *searched]), resolve=False)
-    assert isinstance(values, dict)
     shown = prune(rename_settings(_named(values), explicit={name_in(override) for override in overrides}), settings)
     choices = [f"  {group}: {', '.join(choices_of(group))}" for group in groups]
     heading = "All settings, with the values that these arguments give"
