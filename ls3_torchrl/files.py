@@ -46,7 +46,25 @@ def save_json_atomically(content: dict[str, Any], path: str | Path) -> Path:
         ...     json.loads(save_json_atomically({"answer": 42}, f"{folder}/file.json").read_text())
         {'answer': 42}
     """
-    text = json.dumps(content, indent=2) + "\n"
+    return save_text_atomically(json.dumps(content, indent=2) + "\n", path)
+
+
+def save_text_atomically(text: str, path: str | Path) -> Path:
+    """A text in UTF-8, whole or not at all.
+
+    Args:
+        text: what to save.
+        path: where; its folder is made.
+
+    Returns:
+        The path.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_text_atomically("answer: 42", f"{folder}/file.yaml").read_text()
+        'answer: 42'
+    """
     return _write_atomically(path, lambda file: file.write(text.encode()))
 
 

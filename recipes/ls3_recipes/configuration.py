@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from ls3_recipes.algorithms import ALGORITHMS
+from ls3_recipes.arguments import config_dir, name_in, split_arguments
 from ls3_recipes.options import build, defaults
-from ls3_recipes.renamed import rename_overrides, rename_settings
+from ls3_recipes.renamed import RENAMED, on_command_line, rename_overrides, rename_settings
 from ls3_recipes.run_settings import RunSettings
 
 CONF = Path(__file__).parent / "conf"
@@ -102,7 +106,7 @@ def refuse_irrelevant(overrides: Iterable[str], settings: type, who: str) -> Non
     for override in overrides:
         own: Any = defaults(settings)
         elsewhere: Any = known
-        path = override.partition("=")[0].lstrip("+~").split(".")
+        path = name_in(override).split(".")
         for depth, key in enumerate(path):
             if not isinstance(own, Mapping) or "@" in key:
                 break
@@ -114,15 +118,44 @@ def refuse_irrelevant(overrides: Iterable[str], settings: type, who: str) -> Non
             elsewhere = elsewhere.get(key) if isinstance(elsewhere, Mapping) else None
 
 
-def settings_from(config: DictConfig, settings: type[S]) -> S:
-    """The settings of a composed configuration.
+def _named(values: Any) -> dict[str, Any]:
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items()}
+
+
+def refuse_unread(overrides: Iterable[str], settings: Any) -> None:
+    """Refuse arguments of the command line that set what nothing reads, with the other settings as they are.
 
     Raises:
-        ValueError: for unknown and bad settings, by their full names.
+        ValueError: naming the setting that would make them matter.
+    """
+    unread = settings.unread if isinstance(settings, RunSettings) else {}
+    for override in overrides:
+        name = name_in(override)
+        for section, remedy in unread.items():
+            if f"{name}.".startswith(f"{section}."):
+                raise ValueError(f"{override}: {section} only matters with {remedy}. Add that, or leave {name} out.")
+
+
+def settings_from(
+    config: DictConfig, settings: type[S], overrides: Sequence[str] = (), renamed: Mapping[str, str] = RENAMED
+) -> S:
+    """The settings of a composed configuration, former names in users' files included.
+
+    Args:
+        config: what Hydra composed.
+        settings: their class.
+        overrides: the arguments of the command line among them.
+        renamed: present names by former ones.
+
+    Raises:
+        ValueError: for unknown and bad settings, by their full names, and for arguments that set what nothing reads.
     """
     values = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(values, dict)
-    return build(settings, prune({str(key): value for key, value in values.items()}, settings))
+    named = rename_settings(_named(values), renamed, explicit={name_in(override) for override in overrides})
+    built = build(settings, prune(named, settings))
+    refuse_unread(overrides, built)
+    return built
 
 
 def settings_of_run(folder: str | Path) -> RunSettings:
@@ -136,8 +169,7 @@ def settings_of_run(folder: str | Path) -> RunSettings:
     if not path.is_file():
         raise FileNotFoundError(f"{folder} is no run folder: config.yaml is missing. Pass run=DIR of a finished run.")
     values = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-    assert isinstance(values, dict)
-    renamed = rename_settings({"algorithm": "ls3"} | {str(key): value for key, value in values.items()})
+    renamed = rename_settings({"algorithm": "ls3"} | _named(values))
     if renamed["algorithm"] not in ALGORITHMS:
         raise ValueError(f"{path}: algorithm must be one of {', '.join(ALGORITHMS)}; got {renamed['algorithm']!r}.")
     settings = ALGORITHMS[renamed["algorithm"]].settings_class
@@ -155,7 +187,7 @@ def compose_settings(command: str, settings: type[S], overrides: Sequence[str] =
     overrides = rename_overrides(overrides)
     refuse_irrelevant(overrides, settings, _who(command, overrides))
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return settings_from(compose(command, overrides), settings)
+        return settings_from(compose(command, overrides), settings, overrides)
 
 
 def train_settings(*overrides: str) -> RunSettings:
@@ -183,6 +215,7 @@ def run_command(
     *,
     help_text: str,
     groups: Sequence[str] = (),
+    renamed: Mapping[str, str] = RENAMED,
 ) -> None:
     """Run a command under Hydra, or print its help.
 
@@ -193,37 +226,68 @@ def run_command(
         arguments: of the command line; Hydra's own options are among them.
         help_text: what stands above the list of settings.
         groups: folders of ``conf/`` whose files can be chosen.
+        renamed: present names of its settings by former ones.
 
     Raises:
-        SystemExit: with one line, for settings that cannot be.
+        SystemExit: with one line, for settings that cannot be, and for whatever else is refused before the output
+            folder is made.
     """
-    arguments = rename_overrides(arguments)
-    overrides = [argument for argument in arguments if not argument.startswith("-")]
-    try:
-        refuse_irrelevant(overrides, settings, _who(command, overrides))
-    except ValueError as error:
-        raise SystemExit(f"ls3 {command}: {error}") from None
-    if {"-h", "--help"} & set(arguments):
-        print(help_of(command, settings, overrides, help_text, groups))
-        return
+    who = f"ls3 {command}"
+    options, overrides = split_arguments(arguments)
 
     def under_hydra(config: DictConfig) -> None:
-        try:
-            chosen = settings_from(config, settings)
-        except ValueError as error:
-            raise SystemExit(f"ls3 {command}: {error}") from None
-        job(chosen)
+        with _errors_in_one_line(who):
+            chosen = settings_from(config, settings, overrides, renamed)
+        with _errors_in_one_line(who, Path(getattr(chosen, "output", ""))):
+            job(chosen)
 
-    sys.argv = [sys.argv[0], *arguments]
-    hydra.main(version_base="1.3", config_path=str(CONF), config_name=command)(under_hydra)()
+    with on_command_line(who):
+        overrides = rename_overrides(overrides, renamed)
+        with _errors_in_one_line(who):
+            refuse_irrelevant(overrides, settings, _who(command, overrides))
+            if {"-h", "--help"} & set(options):
+                print(help_of(command, settings, overrides, help_text, groups, folder=config_dir(options)))
+                return
+        sys.argv = [sys.argv[0], *overrides, *options]
+        hydra.main(version_base="1.3", config_path=str(CONF), config_name=command)(under_hydra)()
 
 
-def help_of(command: str, settings: type, overrides: Sequence[str], text: str, groups: Sequence[str] = ()) -> str:
-    """A command's help: what it does, the files that can be chosen, and all its settings as arguments leave them."""
+@contextmanager
+def _errors_in_one_line(who: str, output: Path | None = None) -> Iterator[None]:
+    """End the process with one line for what is wrong with settings, data and files, as long as no output is made."""
+    before = output is not None and output.exists()
+    try:
+        yield
+    except (ValueError, TypeError, FileNotFoundError, FileExistsError, HydraException) as error:
+        begun = output is not None and output.exists() and not before
+        if begun or os.environ.get("HYDRA_FULL_ERROR") == "1":  # Hydra's own wish for the whole trace
+            raise
+        raise SystemExit(f"{who}: {' '.join(str(error).split())}") from None
+
+
+def help_of(
+    command: str,
+    settings: type,
+    overrides: Sequence[str],
+    text: str,
+    groups: Sequence[str] = (),
+    *,
+    folder: str | None = None,
+) -> str:
+    """A command's help: what it does, the files that can be chosen, and all its settings as arguments leave them.
+
+    Args:
+        command: its name.
+        settings: its class of settings.
+        overrides: arguments of the command line.
+        text: what it does.
+        groups: folders of ``conf/`` whose files can be chosen.
+        folder: with a user's own files, as ``--config-dir`` gives it.
+    """
+    searched = [f"hydra.searchpath=[file://{Path(folder).absolute()}]"] if folder else []
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        values = OmegaConf.to_container(compose(command, list(overrides)), resolve=False)
-    assert isinstance(values, dict)
-    shown = prune({str(key): value for key, value in values.items()}, settings)
+        values = OmegaConf.to_container(compose(command, [*overrides, *searched]), resolve=False)
+    shown = prune(rename_settings(_named(values), explicit={name_in(override) for override in overrides}), settings)
     choices = [f"  {group}: {', '.join(choices_of(group))}" for group in groups]
     heading = "All settings, with the values that these arguments give"
     settings_shown = OmegaConf.to_yaml(OmegaConf.create(shown))

@@ -13,7 +13,9 @@ from omegaconf import MISSING
 S = TypeVar("S")
 
 
-def from_signatures(name: str, doc: str, *sources: Callable[..., Any], only: Collection[str] = ()) -> type:
+def from_signatures(
+    name: str, doc: str, *sources: Callable[..., Any], only: Collection[str] = (), without: Collection[str] = ()
+) -> type:
     """A frozen dataclass whose fields are the arguments of functions, constructors or dataclasses.
 
     Every option is defined, documented and checked where it is used; a configuration takes names and defaults from
@@ -24,9 +26,10 @@ def from_signatures(name: str, doc: str, *sources: Callable[..., Any], only: Col
         doc: its docstring.
         sources: whose arguments become fields; no two may have one name.
         only: the arguments that are taken; all keyword-only ones that are no tensordict key when empty.
+        without: the arguments that are not taken, and all others are, instead of ``only``.
 
     Raises:
-        ValueError: when two sources share a name, or one in ``only`` is no argument.
+        ValueError: when two sources share a name, or one in ``only`` or ``without`` is no argument.
 
     Example:
         >>> def fly(height, *, speed=3.0, height_key="z"): ...
@@ -36,17 +39,19 @@ def from_signatures(name: str, doc: str, *sources: Callable[..., Any], only: Col
         Flight(height=2)
     """
     fields: dict[str, Any] = {}
+    named: set[str] = set()
     for source in sources:
         for argument in inspect.signature(source).parameters.values():
             keyword = argument.kind is inspect.Parameter.KEYWORD_ONLY and not argument.name.endswith(("_key", "_keys"))
-            if argument.name in only if only else keyword:
+            named.add(argument.name)
+            if argument.name not in without if without else argument.name in only if only else keyword:
                 if argument.name in fields:
                     raise ValueError(f"{name}: two of {sources} have an argument {argument.name}. Rename one.")
                 default = argument.default
                 fields[argument.name] = dataclasses.field(
                     **({} if default is inspect.Parameter.empty else {"default": default}), kw_only=True
                 )
-    if missing := set(only) - set(fields):
+    if missing := {*only, *without} - named:
         raise ValueError(f"{name}: none of {sources} has an argument {', '.join(sorted(missing))}.")
     made = dataclasses.make_dataclass(name, [(key, Any, value) for key, value in fields.items()], frozen=True)
     made.__doc__ = doc
@@ -90,7 +95,7 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
 
     Raises:
         ValueError: for a name that the dataclass lacks, one that it needs, or (from its own checks) a bad value;
-            always with the section before the name.
+            always with the section before the name. Also for a value in place of a section.
 
     Example:
         >>> Flight = from_signatures("Flight", "How to fly.", lambda *, speed=3.0: None)
@@ -109,6 +114,8 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
     arguments: dict[str, Any] = {}
     for key, value in values.items():
         if key in nested:
+            if value is not None and not isinstance(value, Mapping):
+                raise ValueError(f"{prefix}{key} is a section, got {value!r}: set {prefix}{key}.KEY=VALUE.")
             arguments[key] = build(nested[key], value or {}, prefix + key)
         elif value != MISSING:
             arguments[key] = _tuples(value)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 #: Former name of a setting: its present one.
@@ -25,7 +28,28 @@ RENAMED = {
 RENAMED_OF_BENCHMARK = {"plain": "reference"}
 
 
+#: The command that runs, as its messages name it; ``None`` in programs.
+_COMMAND: ContextVar[str | None] = ContextVar("command", default=None)
+
+
+@contextmanager
+def on_command_line(command: str) -> Iterator[None]:
+    """Inside, a former name is told in one line on the standard error instead of a Python warning.
+
+    Args:
+        command: what the line begins with.
+    """
+    token = _COMMAND.set(command)
+    try:
+        yield
+    finally:
+        _COMMAND.reset(token)
+
+
 def _warn(old: str, new: str) -> None:
+    if command := _COMMAND.get():
+        print(f"{command}: {old} is now {new}", file=sys.stderr)
+        return
     warnings.warn(f"The setting {old} is now called {new}; the former name will not be read for ever.", stacklevel=3)
 
 
@@ -47,10 +71,19 @@ def rename_overrides(overrides: Iterable[str], renamed: Mapping[str, str] = RENA
     return out
 
 
-def rename_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested settings of a file with present names; where both are there, the present one counts."""
+def rename_settings(
+    settings: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED, *, explicit: Collection[str] | None = None
+) -> dict[str, Any]:
+    """Nested settings of a file with present names; where both are there, the present one counts.
+
+    Args:
+        settings: of a file, or composed of several.
+        renamed: present names by former ones.
+        explicit: for composed settings, the present names that arguments set. All others are there by default, and
+            give way to the former ones that a user's file has.
+    """
     out: dict[str, Any] = _copy(settings)
-    for old, new in RENAMED.items():
+    for old, new in renamed.items():
         *path, name = old.split(".")
         section: Any = out
         for key in path:
@@ -64,7 +97,10 @@ def rename_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
         target = out
         for key in path:
             target = target.setdefault(key, {})
-        target.setdefault(name, value)
+        # The task's former penalty was SACfD's: AWAC has always had its own.
+        foreign = old == "task.sacfd_penalty" and out.get("algorithm") == "awac"
+        if name not in target or not (explicit is None or new in explicit or foreign):
+            target[name] = value
     return out
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import platform
 import time
 from collections.abc import Mapping, Sequence
@@ -15,6 +14,8 @@ from omegaconf import OmegaConf
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from torchrl.record.loggers import Logger
+
+from ls3_torchrl.files import save_json_atomically, save_text_atomically
 
 PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "mujoco", "mujoco-warp", "hydra-core", "ls3-torchrl")
 
@@ -92,7 +93,7 @@ class RunFolder:
     def __init__(self, path: str | Path, settings: Mapping[str, Any]) -> None:
         self.path = require_new(path)
         self.path.mkdir(parents=True)
-        (self.path / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(dict(settings))))
+        save_text_atomically(OmegaConf.to_yaml(OmegaConf.create(dict(settings))), self.path / "config.yaml")
         self.write_json("versions.json", versions())
         self.logger = RunLogger(self.path)
 
@@ -107,11 +108,7 @@ class RunFolder:
 
     def write_json(self, name: str, content: dict) -> Path:
         """Write a JSON file in one go: a half-written file never takes its place."""
-        path = self.path / name
-        partial = path.with_suffix(".partial")
-        partial.write_text(json.dumps(content, indent=2) + "\n")
-        partial.replace(path)
-        return path
+        return save_json_atomically(content, self.path / name)
 
     def close(self) -> None:
         """Flush and close what is open."""

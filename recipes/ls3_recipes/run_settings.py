@@ -3,31 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import ls3_envs
 from ls3_recipes.options import from_signatures
+from ls3_torchrl._checks import require_at_least, require_choice
 from ls3_torchrl.agent import AgentArchitecture
 from ls3_torchrl.data import TaggedReplayBuffer
 from ls3_torchrl.trainers import VAEOptions
-
-
-def at_least(value: float, least: float, name: str) -> None:
-    """Refuse a setting below ``least``."""
-    if value < least:
-        raise ValueError(f"{name} must be at least {least}, got {value}.")
-
-
-def positive(value: float, name: str) -> None:
-    """Refuse a setting that is not positive."""
-    if not value > 0:
-        raise ValueError(f"{name} must be positive, got {value}.")
-
-
-def one_of(value: Any, choices: tuple[Any, ...], name: str) -> None:
-    """Refuse a setting that is none of the choices."""
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(map(str, choices))}; got {value!r}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,10 +29,10 @@ class TaskSettings:
 
     def __post_init__(self) -> None:
         """Refuse unknown domains and empty episodes."""
-        one_of(self.name, tuple(ls3_envs.DOMAINS), "name")
+        require_choice(self.name, tuple(ls3_envs.DOMAINS), "name")
         for name in ("horizon", "offline_episodes"):
             if getattr(self, name) is not None:
-                at_least(getattr(self, name), 1, name)
+                require_at_least(getattr(self, name), 1, name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,9 +51,9 @@ class EpisodeSettings:
 
     def __post_init__(self) -> None:
         """Refuse numbers that no run can have."""
-        at_least(self.updates, 0, "updates")
-        at_least(self.episodes_per_update, 1, "episodes_per_update")
-        one_of(self.select, ("last", "best"), "select")
+        require_at_least(self.updates, 0, "updates")
+        require_at_least(self.episodes_per_update, 1, "episodes_per_update")
+        require_choice(self.select, ("last", "best"), "select")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +64,7 @@ class EvaluationSettings:
 
     def __post_init__(self) -> None:
         """Refuse an evaluation of nothing."""
-        at_least(self.episodes, 1, "episodes")
+        require_at_least(self.episodes, 1, "episodes")
 
 
 #: The networks' sizes; what the environment decides is not set.
@@ -89,19 +72,7 @@ AgentSettings = from_signatures(
     "AgentSettings",
     "The arguments of :class:`~ls3_torchrl.agent.AgentArchitecture` that the environment does not decide.",
     AgentArchitecture,
-    only=(
-        "latent_dim",
-        "num_dynamics",
-        "num_values",
-        "dynamics_hidden",
-        "value_hidden",
-        "classifier_hidden",
-        "initial_value",
-        "propagation",
-        "control_affine",
-        "action_scale",
-        "background",
-    ),
+    without=("action_dim", "in_channels"),
 )
 
 BufferSettings = from_signatures(
@@ -127,9 +98,11 @@ class RunSettings:
         threads: intra-op threads; ``None`` leaves PyTorch's choice.
         pictures: leave pictures in the run's folder.
         task: what is learnt.
-        agent: sizes of the networks.
+        agent: sizes of the networks. To a baseline that reads latents, all of them matter: it makes the whole agent, so
+            that with the same seed it draws the same random numbers, and the VAE is LS³'s bit for bit.
         vae: equation (1).
-        buffer: what is kept of episodes.
+        buffer: what is kept of episodes; ``dynamics_after_violation`` matters to a baseline by the prediction term of
+            the VAE alone.
         online: how many episodes.
         evaluation: in how many episodes the agent is evaluated.
     """
@@ -149,3 +122,8 @@ class RunSettings:
     buffer: BufferSettings  # type: ignore[valid-type]
     online: EpisodeSettings
     evaluation: EvaluationSettings
+
+    @property
+    def unread(self) -> dict[str, str]:
+        """Sections that nothing reads as the settings are, and the setting that would change that."""
+        return {}

@@ -1,5 +1,6 @@
 """What tasks, presets and arguments resolve to, and what is refused."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -50,7 +51,7 @@ TABLE_1 = {
     "loss.gamma_safe_set": 0.3,
 }
 
-# What the supplement's text says beside the table, and the counts of the original experiments.
+# What the supplement's text says in addition to the table, and the counts of the original experiments.
 TEXT = {
     "agent.dynamics_hidden": [128, 128],
     "agent.value_hidden": [256, 256, 256],
@@ -204,6 +205,28 @@ def test_settings_that_only_other_algorithms_have_are_refused(algorithm, overrid
         train_settings(f"algorithm={algorithm}", "preset=cpu", override)
 
 
+@pytest.mark.parametrize(
+    ("others", "override", "remedy"),
+    [
+        (["algorithm=bc", "encoder=conv"], "vae.steps=5", "vae only matters with encoder=latents"),
+        (["algorithm=awac", "encoder=conv"], "agent.num_dynamics=9", "agent only matters with encoder=latents"),
+        (["algorithm=sacfd", "encoder=conv"], "++vae.steps=5", "vae only matters with encoder=latents"),
+        (["algorithm=sacfd"], "policy.risk.gamma=0.5", "policy.risk only matters with recovery=true"),
+    ],
+)
+def test_arguments_that_nothing_reads_are_refused_with_what_makes_them_matter(others, override, remedy):
+    with pytest.raises(ValueError, match=re.escape(f"{override}: {remedy}. Add that, or leave ")):
+        train_settings("preset=smoke", *others, override)
+    train_settings("preset=smoke", *others)  # what files bring is left unread
+    train_settings("preset=smoke", others[0], remedy.split()[-1], override)
+
+
+def test_what_matters_to_the_vae_of_a_baseline_can_be_set():
+    overrides = ("vae.steps=5", "agent.num_dynamics=9", "buffer.dynamics_after_violation=false")
+    settings = as_dict(train_settings("algorithm=bc", "preset=smoke", *overrides))
+    assert (settings["vae"]["steps"], settings["agent"]["num_dynamics"]) == (5, 9)
+
+
 def test_files_bring_the_settings_of_all_algorithms_and_each_is_left_its_own():
     settings = as_dict(train_settings("algorithm=sacfd", "preset=cpu", "task=pushing"))
     assert not {"planner", "optim", "loss", "offline"} & set(settings)
@@ -251,13 +274,13 @@ def test_a_file_with_a_setting_that_nobody_has_is_refused(setting, message):
         ("loss.monte_carlo=true", r"^loss\.monte_carlo needs buffer\.continue_failures=true"),
         ("online.updates=-1", r"^online\.updates"),
         ("online.episodes_per_update=0", r"^online\.episodes_per_update"),
-        ("online.select=first", r"^online\.select must be one of last, best; got 'first'"),
+        ("online.select=first", r"^online\.select must be one of 'last', 'best'; got 'first'"),
         ("online.fraction=1.0", r"^online\.fraction"),
         ("online.dynamics_steps=-1", r"^online\.dynamics_steps"),
         ("evaluation.episodes=0", r"^evaluation\.episodes"),
         ("task.horizon=0", r"^task\.horizon"),
         ("task.offline_episodes=0", r"^task\.offline_episodes"),
-        ("task.name=moon", r"^task\.name must be one of navigation, .*got 'moon'"),
+        ("task.name=moon", r"^task\.name must be one of 'navigation', .*got 'moon'"),
     ],
 )
 def test_impossible_settings_are_refused_by_their_full_names(override, message):

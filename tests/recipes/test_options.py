@@ -46,6 +46,13 @@ def test_fields_are_keyword_arguments_that_are_no_keys():
     }
 
 
+def test_all_arguments_but_some_can_be_taken():
+    flight = from_signatures("Flight", "How.", fly, without=("height_key", "in_keys"))
+    assert defaults(flight) == {"height": MISSING, "speed": 3.0}
+    with pytest.raises(ValueError, match="argument weight"):
+        from_signatures("Flight", "How.", fly, without=("weight",))
+
+
 def test_arguments_that_clash_or_are_not_there_are_noticed():
     with pytest.raises(ValueError, match="argument speed"):
         from_signatures("Flight", "How.", fly, fly)
@@ -69,6 +76,8 @@ def test_nested_settings_are_built_with_defaults_and_lists_as_tuples_and_back():
     [
         ({"middle": {"inner": {"size": 0}}}, r"^middle\.inner\.size must be at least 1, got 0\.$"),
         ({"middle": {"inner": {"sise": 2}}}, r"^middle\.inner has no setting sise\. It has: size, rates\.$"),
+        ({"middle": "a"}, r"^middle is a section, got 'a': set middle\.KEY=VALUE\.$"),
+        ({"middle": {"inner": 3}}, r"^middle\.inner is a section, got 3: set middle\.inner\.KEY=VALUE\.$"),
         ({"midle": {}}, r"^The run has no setting midle\. It has: middle, names\.$"),
         ({"middle": {"inner": {}}}, r"^middle\.inner\.size must be given"),
         ({"middle": {"inner": {"size": MISSING}}}, r"^middle\.inner\.size must be given"),

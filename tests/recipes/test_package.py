@@ -8,14 +8,14 @@ import pytest
 PACKAGE = Path(__file__).parents[2] / "recipes" / "ls3_recipes"
 
 # What each part may import of the package, besides itself.
-LOWEST = {"options", "renamed", "console", "device", "figures"}
+LOWEST = {"arguments", "options", "renamed", "console", "device", "figures"}
 MAY_IMPORT: dict[str, set[str]] = {part: set() for part in LOWEST}
 MAY_IMPORT["run_settings"] = {"options"}
 MAY_IMPORT["run_folder"] = set()
 MAY_IMPORT["rollout"] = {"console", "run_settings"}
 MAY_IMPORT["plots"] = {"run_folder", "run_settings"}
 MAY_IMPORT["algorithms"] = {"options", "run_settings", "plots"}
-MAY_IMPORT["configuration"] = {"options", "renamed", "run_settings", "algorithms"}
+MAY_IMPORT["configuration"] = {"arguments", "options", "renamed", "run_settings", "algorithms"}
 MAY_IMPORT["protocol"] = LOWEST | {"run_settings", "run_folder", "rollout", "plots", "algorithms"}
 MAY_IMPORT["benchmark"] = LOWEST | {"run_settings", "run_folder", "algorithms", "configuration"}
 MAY_IMPORT["commands"] = set(MAY_IMPORT)

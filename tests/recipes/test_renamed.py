@@ -62,6 +62,21 @@ def test_where_both_names_are_there_the_present_one_counts():
     assert new["policy"] == {"penalty": -1}
 
 
+def test_in_composed_settings_a_former_name_wins_over_defaults_but_not_over_arguments():
+    composed = {"online": {"share": 0.2, "fraction": 0.5}}
+    with pytest.warns(UserWarning, match=r"online\.fraction"):
+        assert rename_settings(composed, explicit=()) == {"online": {"fraction": 0.2}}
+    with pytest.warns(UserWarning, match=r"online\.fraction"):
+        assert rename_settings(composed, explicit={"online.fraction"}) == {"online": {"fraction": 0.5}}
+
+
+def test_the_former_penalty_of_sacfd_is_none_of_awac():
+    for algorithm, penalty in (("sacfd", -5), ("awac", -1)):
+        composed = {"algorithm": algorithm, "task": {"sacfd_penalty": -5}, "policy": {"penalty": -1}}
+        with pytest.warns(UserWarning, match=r"policy\.penalty"):
+            assert rename_settings(composed, explicit=())["policy"] == {"penalty": penalty}
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_run_of_before_the_renaming_has_the_settings_that_it_had(tmp_path, algorithm):
     settings = train_settings(f"algorithm={algorithm}", "preset=smoke", "buffer.gamma=0.9", "buffer.success_tail=7")

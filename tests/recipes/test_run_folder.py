@@ -3,6 +3,7 @@
 import json
 import platform
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
@@ -46,6 +47,16 @@ def test_a_folder_begins_with_settings_and_versions_and_is_never_reused(tmp_path
     assert folder.checkpoint(7).name == "agent_007.pt"
     with pytest.raises(FileExistsError, match=r"exists already.*output=DIR"):
         RunFolder(tmp_path / "run", {})
+
+
+def test_settings_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    def fail(self, target):
+        raise OSError("no power")
+
+    monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises(OSError, match="no power"):
+        RunFolder(tmp_path / "run", {"seed": 3})
+    assert not (tmp_path / "run" / "config.yaml").exists()
 
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path):

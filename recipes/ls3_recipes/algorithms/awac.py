@@ -11,7 +11,7 @@ from ls3_recipes.algorithms.actor_critic import ActorCritic
 from ls3_recipes.algorithms.baseline import ActorCriticSettings, BaselineSettings
 from ls3_recipes.options import as_dict
 from ls3_recipes.plots.style import Label
-from ls3_recipes.run_settings import positive
+from ls3_torchrl._checks import require_positive
 from ls3_torchrl.baselines import AWACLoss
 from ls3_torchrl.data import ALL_TAGS, TaggedReplayBuffer
 
@@ -34,7 +34,7 @@ class AWACPolicySettings(ActorCriticSettings):
     def __post_init__(self) -> None:
         """Refuse what would only fail after time was spent."""
         super().__post_init__()
-        positive(self.temperature, "temperature")
+        require_positive(self.temperature, "temperature")
 
 
 @dataclass(frozen=True, kw_only=True)

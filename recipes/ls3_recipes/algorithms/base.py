@@ -98,7 +98,7 @@ class Algorithm(ABC):
         """Take the networks of a file."""
 
     def plot(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> None:  # noqa: B027
-        """Pictures of its own, beside those that every run leaves."""
+        """Pictures of its own, in addition to those that every run leaves."""
 
 
 def make_agent(

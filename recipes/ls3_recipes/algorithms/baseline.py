@@ -19,8 +19,9 @@ from torchrl.record.loggers import Logger
 from ls3_recipes.algorithms.base import Algorithm, make_agent
 from ls3_recipes.plots.agent import plot_reconstructions
 from ls3_recipes.plots.plane import Field, maps, over_plane, plane_of
-from ls3_recipes.run_settings import RunSettings, at_least, one_of, positive
+from ls3_recipes.run_settings import RunSettings
 from ls3_torchrl import LS3Agent
+from ls3_torchrl._checks import require_at_least, require_choice, require_positive
 from ls3_torchrl.baselines import PixelFeatures, action_bounds
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.files import save_atomically
@@ -50,10 +51,10 @@ class PolicySettings:
     def __post_init__(self) -> None:
         """Refuse what would only fail after time was spent."""
         for size in self.hidden:
-            at_least(size, 1, "hidden")
-        positive(self.lr, "lr")
-        at_least(self.batch_size, 1, "batch_size")
-        at_least(self.cloning_steps, 0, "cloning_steps")
+            require_at_least(size, 1, "hidden")
+        require_positive(self.lr, "lr")
+        require_at_least(self.batch_size, 1, "batch_size")
+        require_at_least(self.cloning_steps, 0, "cloning_steps")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,19 +82,20 @@ class ActorCriticSettings(PolicySettings):
         super().__post_init__()
         if self.penalty > 0.0:
             raise ValueError(f"penalty is added to the reward of a violation: 0 or below, got {self.penalty}.")
-        positive(self.initial_std, "initial_std")
-        positive(self.tau, "tau")
-        at_least(self.critic_steps, 0, "critic_steps")
-        at_least(self.updates_per_step, 0, "updates_per_step")
+        require_positive(self.initial_std, "initial_std")
+        require_positive(self.tau, "tau")
+        require_at_least(self.critic_steps, 0, "critic_steps")
+        if self.updates_per_step < 0:
+            raise ValueError(f"updates_per_step must be at least 0, got {self.updates_per_step}.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineSettings(RunSettings):
-    """What a run of a baseline has, beside what every run has.
+    """What a run of a baseline has, in addition to what every run has.
 
     Args:
         encoder: ``"latents"``, the means of the VAE that LS³ trains, frozen; or ``"conv"``, convolutions of each
-            network's own.
+            network's own, with which nothing reads ``agent`` and ``vae``.
         policy: of the actor and, where it has them, its critics.
     """
 
@@ -102,7 +104,12 @@ class BaselineSettings(RunSettings):
 
     def __post_init__(self) -> None:
         """Refuse unknown encoders."""
-        one_of(self.encoder, ("latents", "conv"), "encoder")
+        require_choice(self.encoder, ("latents", "conv"), "encoder")
+
+    @property
+    def unread(self) -> dict[str, str]:
+        """Without the VAE, neither its training nor the networks that are made with it."""
+        return dict.fromkeys(("agent", "vae"), "encoder=latents") if self.encoder == "conv" else {}
 
 
 class Baseline(Algorithm):

@@ -58,7 +58,7 @@ PlannerSettings = from_signatures(
 
 @dataclass(frozen=True, kw_only=True)
 class LS3Settings(RunSettings):
-    """What a run of LS³ has, beside what every run has."""
+    """What a run of LS³ has, in addition to what every run has."""
 
     buffer: BufferSettings  # type: ignore[valid-type]
     online: OnlineSettings

@@ -19,7 +19,7 @@ from ls3_recipes.algorithms.baseline import DEMONSTRATIONS, ActorCriticSettings,
 from ls3_recipes.options import as_dict
 from ls3_recipes.plots.plane import Field
 from ls3_recipes.plots.style import Label
-from ls3_recipes.run_settings import at_least, positive
+from ls3_torchrl._checks import require_at_least, require_positive, require_unit_interval
 from ls3_torchrl.baselines import RecoveryPolicy, SafetyCritic, SafetyCriticLoss, deterministic_actor
 from ls3_torchrl.data import ALL_TAGS, Tag, TaggedReplayBuffer
 
@@ -41,9 +41,8 @@ class RiskSettings:
     def __post_init__(self) -> None:
         """Refuse what is no probability."""
         for name in ("gamma", "threshold"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}.")
-        at_least(self.offline_steps, 0, "offline_steps")
+            require_unit_interval(getattr(self, name), name)
+        require_at_least(self.offline_steps, 0, "offline_steps")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +52,7 @@ class SACfDPolicySettings(ActorCriticSettings):
     Args:
         alpha: weight of the entropy, for rewards of -1 a step; above 0.
         learn_alpha: whether it is learnt.
-        risk: of the safety critic.
+        risk: of the safety critic, which there is with recovery alone.
     """
 
     alpha: float = 0.02
@@ -63,7 +62,7 @@ class SACfDPolicySettings(ActorCriticSettings):
     def __post_init__(self) -> None:
         """Refuse what would only fail after time was spent."""
         super().__post_init__()
-        positive(self.alpha, "alpha")
+        require_positive(self.alpha, "alpha")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +81,11 @@ class SACfDSettings(BaselineSettings):
         super().__post_init__()
         if not isinstance(self.recovery, bool):
             raise ValueError(f"recovery must be true or false, got {self.recovery!r}.")
+
+    @property
+    def unread(self) -> dict[str, str]:
+        """Without recovery, nothing of the safety critic."""
+        return super().unread | ({} if self.recovery else {"policy.risk": "recovery=true"})
 
 
 class SACfD(ActorCritic):
@@ -123,7 +127,7 @@ class SACfD(ActorCritic):
         return critic
 
     def make_buffer(self, device: torch.device, **labels: Any) -> TaggedReplayBuffer:
-        """With recovery, with what the task's policy wanted, beside what was done."""
+        """With recovery, with what the task's policy wanted, in addition to what was done."""
         return super().make_buffer(device, extra_keys=("task_action",) if self.recovery else (), **labels)
 
     def offline_data(self, offline: dict[Tag, TensorDictBase]) -> dict[Tag, TensorDictBase]:

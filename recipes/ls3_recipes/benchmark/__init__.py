@@ -1,1 +1,1 @@
-"""How long everything takes here, beside the same networks with nothing done for speed."""
+"""How long everything takes here, compared with the same networks with nothing done for speed."""

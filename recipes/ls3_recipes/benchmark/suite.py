@@ -1,4 +1,4 @@
-"""How long everything takes on this machine, beside a plain fp32 eager path in the same run."""
+"""How long everything takes on this machine, compared with a plain fp32 eager path in the same run."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from ls3_recipes.console import console
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.options import as_dict
 from ls3_recipes.run_folder import RunFolder
-from ls3_recipes.run_settings import at_least, one_of, positive
 from ls3_torchrl import LS3Agent
+from ls3_torchrl._checks import require_at_least, require_choice, require_positive
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.trainers.learner import threads
 
@@ -67,11 +67,11 @@ class BenchmarkSettings:
         if not self.presets:
             raise ValueError("presets must name at least one preset, such as presets=[cpu]; got none.")
         for domain in (self.task, *(self.domains or ())):
-            one_of(domain, tuple(ls3_envs.DOMAINS), "domains")
+            require_choice(domain, tuple(ls3_envs.DOMAINS), "domains")
         for batch in self.batches:
-            at_least(batch, 1, "batches")
-        at_least(self.states, 1, "states")
-        positive(self.seconds, "seconds")
+            require_at_least(batch, 1, "batches")
+        require_at_least(self.states, 1, "states")
+        require_positive(self.seconds, "seconds")
 
 
 def run_benchmark(settings: BenchmarkSettings) -> dict:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from ls3_recipes.benchmark.suite import BenchmarkSettings, run_benchmark
 from ls3_recipes.configuration import register, run_command
-from ls3_recipes.renamed import RENAMED_OF_BENCHMARK, rename_overrides
+from ls3_recipes.renamed import RENAMED_OF_BENCHMARK
 
 HELP = """
 Time planning, updates, the VAE, encoding, environments and buffer; write benchmark.json and a table.
@@ -22,5 +22,6 @@ register("benchmark", BenchmarkSettings)
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
-    arguments = rename_overrides(sys.argv[1:] if arguments is None else arguments, RENAMED_OF_BENCHMARK)
-    run_command("benchmark", BenchmarkSettings, run_benchmark, arguments, help_text=HELP)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    renamed = RENAMED_OF_BENCHMARK
+    run_command("benchmark", BenchmarkSettings, run_benchmark, arguments, help_text=HELP, renamed=renamed)

@@ -20,7 +20,8 @@ from ls3_recipes.options import as_dict, defaults
 from ls3_recipes.plots.run import save_video
 from ls3_recipes.rollout import make_env, run_episodes
 from ls3_recipes.run_folder import RunFolder
-from ls3_recipes.run_settings import RunSettings, at_least
+from ls3_recipes.run_settings import RunSettings
+from ls3_torchrl._checks import require_at_least
 
 HELP = """
 Evaluate a trained agent: a table, summary.json and a video.
@@ -63,7 +64,7 @@ class EvaluateSettings:
 
     def __post_init__(self) -> None:
         """Refuse an evaluation of nothing."""
-        at_least(self.episodes, 1, "episodes")
+        require_at_least(self.episodes, 1, "episodes")
 
     @property
     def planner_changes(self) -> dict[str, Any]:

@@ -34,12 +34,17 @@ class ReportSettings:
     """What is compared, and where it goes.
 
     Args:
-        runs: folders of finished runs, of any of the algorithms.
+        runs: folders of finished runs, of any of the algorithms; one alone need not be a list.
         output: a folder that does not exist yet.
     """
 
     runs: tuple[str, ...] = ()
     output: str
+
+    def __post_init__(self) -> None:
+        """Take a single folder as a list of one."""
+        if isinstance(self.runs, str):
+            object.__setattr__(self, "runs", (self.runs,))
 
 
 register("report", ReportSettings)

@@ -99,6 +99,14 @@ def test_the_gallerys_help(capsys):
         (["train", "algorithm=sacfd", "planner.horizon=9"], "ls3 train: planner.horizon=9: sacfd has no planner."),
         (["train", "algorithm=dqn"], "ls3 train: algorithm must be one of"),
         (["train", "preset=smoke", "vae.steps=0"], "ls3 train: vae.steps must be at least 1, got 0."),
+        (["train", "planner=foo"], "ls3 train: planner is a section, got 'foo': set planner.KEY=VALUE."),
+        (["train", "preset=smoke", "planner.num_elites=99"], "ls3 train: planner.num_elites must lie"),
+        (["train", "preset=smoke", "agent.latent_dim=0"], "ls3 train: agent.latent_dim must be at least 1"),
+        (["train", "preset=smoke", "buffer.success_tail=0"], "ls3 train: buffer.success_tail must be at least 1"),
+        (["train", "preset=smoke", "data=nowhere"], "ls3 train: "),
+        (["evaluate", "run=nowhere"], "ls3 evaluate: nowhere is no run folder"),
+        (["report", "runs=nowhere"], "ls3 report: nowhere "),
+        (["train", "preset=fast", "--help"], "ls3 train: In 'train': Could not find 'preset/fast'"),
         (["collect", "planner.horizon=9"], "ls3 collect: planner.horizon=9: ls3 collect has no planner."),
     ],
 )
@@ -110,6 +118,50 @@ def test_settings_that_cannot_be_end_the_command_with_one_line(monkeypatch, tmp_
     assert str(stopped.value).startswith(message)
     assert "\n" not in str(stopped.value)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def own_preset(tmp_path, monkeypatch):
+    """A user's preset with a former name, and no work done."""
+    (tmp_path / "cd" / "preset").mkdir(parents=True)
+    preset = "# @package _global_\npreset: mine\nonline: {share: 0.2, updates: 7}\n"
+    (tmp_path / "cd" / "preset" / "mine.yaml").write_text(preset)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["ls3"])
+    chosen = []
+    monkeypatch.setattr(importlib.import_module("ls3_recipes.commands.train"), "run_experiment", chosen.append)
+    return chosen
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fraction"), [([], 0.2), (["online.fraction=0.3"], 0.3), (["online.share=0.4"], 0.4)]
+)
+def test_former_names_in_a_users_files_are_read_and_told_in_one_line(own_preset, capfd, arguments, fraction):
+    main(["train", "task=reacher", "--config-dir", "cd", "preset=mine", *arguments])
+    assert [(settings.online.fraction, settings.online.updates) for settings in own_preset] == [(fraction, 7)]
+    assert set(capfd.readouterr().err.splitlines()) == {"ls3 train: online.share is now online.fraction"}
+
+
+@pytest.mark.parametrize("option", [["--config-dir", "cd"], ["--config-dir=cd"], ["-cd", "cd"]])
+def test_help_shows_a_users_files(own_preset, capsys, option):
+    main(["train", *option, "preset=mine", "--help"])
+    printed = capsys.readouterr().out
+    assert "updates: 7" in printed
+    assert "fraction: 0.2" in printed
+    assert own_preset == []
+
+
+def test_errors_after_the_folder_was_made_keep_their_trace(own_preset, monkeypatch, tmp_path):
+    def fail(settings):
+        Path(settings.output).mkdir()
+        raise ValueError("late")
+
+    train = importlib.import_module("ls3_recipes.commands.train")
+    monkeypatch.setattr(train, "run_experiment", fail)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    with pytest.raises(SystemExit) as stopped:
+        main(["train", "output=made"])
+    assert stopped.value.code == 1  # Hydra's, which has printed the trace
 
 
 @pytest.mark.slow
