@@ -114,3 +114,9 @@ def test_the_table_has_no_circle():
 )
 def test_the_check_itself_finds_what_it_should(source, part, expected):
     assert forbidden(source, part, f"ls3_torchrl.{part}") == expected
+
+
+def test_no_two_test_files_have_one_name():
+    # pytest imports them by their names alone.
+    names = [path.name for path in (ROOT / "tests").rglob("*.py") if path.name != "conftest.py"]
+    assert sorted(names) == sorted(set(names))

@@ -215,7 +215,9 @@ def load_episodes(
     folder = Path(folder)
     path = folder / _DESCRIPTION
     if not path.is_file():
-        raise FileNotFoundError(f"{folder} holds no episodes: {_DESCRIPTION} is missing. Make some with collect.py.")
+        raise FileNotFoundError(
+            f"{folder} holds no episodes: {_DESCRIPTION} is missing. Write some with save_episodes(), or `ls3 collect`."
+        )
     description = json.loads(path.read_text())
     kind, version = description.get("format"), description.get("version")
     if kind != FORMAT or version not in (1, VERSION):

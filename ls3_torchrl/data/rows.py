@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey, NonTensorData, TensorDict, TensorDictBase
 from torch import Tensor
 
-from ls3_torchrl.data.keys import EpisodeKeys
+from ls3_torchrl.data.keys import EpisodeKeys, as_tuple
 from ls3_torchrl.data.labels import after_violation, failure_tail, in_success, reward_to_go, timed_out
 from ls3_torchrl.data.tags import Tag
 
@@ -22,8 +22,11 @@ OWN_KEYS: frozenset[NestedKey] = frozenset(
 
 
 def require_free(keys: Iterable[NestedKey]) -> None:
-    """Raise ``ValueError`` for keys that rows need for themselves."""
-    taken = sorted(map(str, OWN_KEYS.intersection(keys)))
+    """Raise ``ValueError`` for keys that rows need for themselves, or that lie below or above one of these."""
+    own = [as_tuple(key) for key in OWN_KEYS]
+    taken = sorted(
+        str(key) for key in keys if any(as_tuple(key)[: len(mine)] == mine[: len(as_tuple(key))] for mine in own)
+    )
     if taken:
         raise ValueError(f"The keys {taken} are the buffer's own. Rename these entries of the episodes.")
 

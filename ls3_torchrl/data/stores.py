@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from torchrl.data.replay_buffers.storages import Storage
 
 #: Rows that are copied at a time where all of them might not fit into memory.
 _CHUNK = 1024
+#: Marks a folder that a store made for its own use.
+_SCRATCH = "scratch.txt"
 
 
 class RowStore(TensorDictReplayBuffer):
@@ -69,7 +72,9 @@ class RowStore(TensorDictReplayBuffer):
     def extend(self, rows: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Write rows ``[n]``; returns where, int64 ``[n]``."""
         if self._folder is not None and not self.storage.initialized:
-            _remove_store(self._folder)
+            _clear(self._folder, _is_scratch)
+            self._folder.mkdir(parents=True, exist_ok=True)
+            (self._folder / _SCRATCH).write_text("A replay buffer's memory while it is in use; it can be removed.\n")
         # Else a store that is first written under inference_mode() could never be written outside of it.
         with torch.inference_mode(False), torch.no_grad():
             return super().extend(rows.detach(), update_priority=update_priority)
@@ -100,7 +105,7 @@ class RowStore(TensorDictReplayBuffer):
     def dumps(self, path: str | Path) -> None:
         """Write the rows and counters below the folder ``path``."""
         path = Path(path)
-        _remove_store(path)
+        _clear(path, _is_dump)
         path.mkdir(parents=True, exist_ok=True)
         if len(self):
             self.storage[:].memmap(str(path / "rows"), copy_existing=True)
@@ -132,12 +137,25 @@ class RowStore(TensorDictReplayBuffer):
         self.writer.load_state_dict({"_cursor": counters["cursor"], "_write_count": counters["write_count"]})
 
 
-def _remove_store(folder: Path) -> None:
-    """Remove what a store has left; refuse to remove anything else."""
+def _clear(folder: Path, is_ours: Callable[[Path], bool]) -> None:
+    """Remove what an earlier store has left; refuse to remove anything else."""
     if not folder.exists() or not any(folder.iterdir()):
         return
-    if not (folder / "meta.json").is_file():
+    if not is_ours(folder):
         raise FileExistsError(
-            f"{folder} holds files that no replay buffer has written. Choose another folder, or empty it first."
+            f"{folder} holds files that are not a replay buffer's to remove. Choose another folder, or empty it first."
         )
     shutil.rmtree(folder)
+
+
+def _is_scratch(folder: Path) -> bool:
+    """Whether a store kept its rows here while it was in use; what ``dumps`` saved is none, nor is any memory map."""
+    return (folder / _SCRATCH).is_file()
+
+
+def _is_dump(folder: Path) -> bool:
+    """Whether ``dumps`` wrote this."""
+    try:
+        return {"cursor", "write_count"} <= set(json.loads((folder / "meta.json").read_text()))
+    except (OSError, ValueError, TypeError):
+        return False

@@ -75,4 +75,4 @@ class EnsembleMLP(nn.Module):
             hidden = torch.baddbmm(hidden_bias, hidden, hidden_weight).relu_()
         with torch.autocast(hidden.device.type, enabled=False):
             hidden = torch.baddbmm(bias, hidden.to(weight.dtype), weight)
-        return hidden.transpose(0, 1).reshape(*batch, self.num_members, -1)
+        return hidden.transpose(0, 1).reshape(*batch, self.num_members, weight.shape[-1])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any, Literal
 
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 from ls3_torchrl._checks import require_choice
 from ls3_torchrl.layers import Precision
@@ -20,7 +22,7 @@ EngineName = Literal["auto", "fused", "rollout"]
 class Engine:
     """Chooses between :class:`FusedImagination` and :class:`RolloutImagination`, anew at each request.
 
-    Modules may be exchanged, or hooked, between two plans.
+    Modules may be exchanged, or hooked, between two plans: :meth:`choose` is told which they are now.
 
     Args:
         env: the learned model.
@@ -52,19 +54,28 @@ class Engine:
         require_choice(constraint_reduction, ("max", "mean"), "constraint_reduction")
         require_choice(safe_set_reduction, ("mean", "min"), "safe_set_reduction")
         self.name: EngineName = name
-        self._modules = env, value, safe_set
         self._precision: Precision = precision
         self._reductions: dict[str, Any] = {
             "constraint_reduction": constraint_reduction,
             "safe_set_reduction": safe_set_reduction,
         }
-        self._rollout = RolloutImagination(*self._modules, **self._reductions)
-        self._fused: FusedImagination | None = None
+        self._take(env, value, safe_set)
         if name == "fused":
             require_fusable(*self._modules)
 
-    def choose(self) -> Imagination:
-        """What imagines plans now."""
+    def _take(self, env: LatentEnv, value: TensorDictModuleBase, safe_set: TensorDictModuleBase) -> None:
+        self._modules = env, value, safe_set
+        self._parts = _parts(*self._modules)
+        self._rollout = RolloutImagination(*self._modules, **self._reductions)
+        self._fused: FusedImagination | None = None
+
+    def choose(
+        self, modules: tuple[LatentEnv, TensorDictModuleBase, TensorDictModuleBase] | None = None
+    ) -> Imagination:
+        """What imagines plans with these modules: what did so before, unless one of them is another one now."""
+        modules = self._modules if modules is None else modules
+        if any(map(operator.is_not, _parts(*modules), self._parts)):
+            self._take(*modules)
         if self.name == "rollout":
             return self._rollout
         if self.name == "fused":
@@ -74,3 +85,8 @@ class Engine:
         if self._fused is None:
             self._fused = FusedImagination(*self._modules, precision=self._precision, **self._reductions)
         return self._fused
+
+
+def _parts(env: LatentEnv, value: nn.Module, safe_set: nn.Module) -> tuple[object, ...]:
+    """The modules, and those that the environment calls, by which an exchange is told."""
+    return env, value, safe_set, *(getattr(env, name, None) for name in ("dynamics", "constraint", "goal"))

@@ -83,6 +83,11 @@ class LatentEnv(ModelBasedEnvBase):
         self.constraint_prob_key, self.goal_prob_key = unravel_key(constraint_prob_key), unravel_key(goal_prob_key)
         self._set_specs(action_spec, unravel_key(reward_key))
 
+    def __setattr__(self, name: str, value: object) -> None:
+        super().__setattr__(name, value)
+        if name == "dynamics":  # by the name that TorchRL calls them, too
+            super().__setattr__("world_model", value)
+
     def _set_specs(self, action_spec: TensorSpec, reward_key: NestedKey) -> None:
         options = {"device": self.device, "dtype": self.latent_dtype}
         latent = Unbounded(shape=(self.latent_dim,), **options)

@@ -201,7 +201,7 @@ class LS3Planner(MPCPlannerBase):
     @property
     def imagine(self) -> Imagination:
         """What imagines plans now: modules may have been exchanged, or hooked, since the last plan."""
-        return self.engine.choose()
+        return self.engine.choose((self.env, self.value, self.safe_set))
 
     def sample_noise(self, batch: int) -> PlanNoise:
         """All noise that a plan for ``batch`` rows can need; large, meant for tests and comparisons."""

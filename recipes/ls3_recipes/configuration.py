@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
 import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
@@ -23,6 +24,7 @@ from ls3_recipes.run_settings import RunSettings
 
 CONF = Path(__file__).parent / "conf"
 S = TypeVar("S")
+_HEADING = "All settings, with the values that these arguments give"
 
 
 def register(name: str, settings: type) -> None:
@@ -186,7 +188,8 @@ def compose_settings(command: str, settings: type[S], overrides: Sequence[str] =
     """
     overrides = rename_overrides(overrides)
     refuse_irrelevant(overrides, settings, _who(command, overrides))
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    # A command that asks for another one's settings has Hydra already.
+    with nullcontext() if GlobalHydra().is_initialized() else initialize_config_dir(str(CONF), version_base="1.3"):
         return settings_from(compose(command, overrides), settings, overrides)
 
 
@@ -271,7 +274,6 @@ def help_of(
     overrides: Sequence[str],
     text: str,
     groups: Sequence[str] = (),
-    *,
     folder: str | None = None,
 ) -> str:
     """A command's help: what it does, the files that can be chosen, and all its settings as arguments leave them.
@@ -289,10 +291,8 @@ def help_of(
         values = OmegaConf.to_container(compose(command, [*overrides, *searched]), resolve=False)
     shown = prune(rename_settings(_named(values), explicit={name_in(override) for override in overrides}), settings)
     choices = [f"  {group}: {', '.join(choices_of(group))}" for group in groups]
-    heading = "All settings, with the values that these arguments give"
-    settings_shown = OmegaConf.to_yaml(OmegaConf.create(shown))
     parts = [text.strip(), *(["\n".join(["Choices", *choices])] if choices else [])]
-    return "\n\n".join([*parts, f"{heading}\n{'-' * len(heading)}\n{settings_shown}"])
+    return "\n\n".join([*parts, f"{_HEADING}\n{'-' * len(_HEADING)}\n{OmegaConf.to_yaml(OmegaConf.create(shown))}"])
 
 
 def choices_of(group: str) -> list[str]:

@@ -2,7 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ls3_torchrl.data import Tag, TaggedReplayBuffer
+from ls3_torchrl.data import EpisodeKeys, Tag, TaggedReplayBuffer
 from ls3_torchrl.modules import PixelEncoder
 
 D = 4
@@ -449,3 +449,29 @@ def test_a_buffer_full_of_short_episodes_still_has_their_frames(scratch, encoded
     torch.testing.assert_close(rows["next", "loc"][:, 0], rows["action"][:, 0] + 1, atol=1e-2, rtol=0)
     batch = buffer.sample_frame_transitions(50)
     assert torch.equal(batch["pixels"][:, 0, 0, 0].float(), batch["action"][:, 0])
+
+
+def test_a_scratch_folder_never_costs_what_was_saved(tmp_path):
+    camera = Camera()
+    buffer = TaggedReplayBuffer(20, latent_dim=D)
+    buffer.add(camera.shoot(3), "success")
+    buffer.dumps(tmp_path / "saved")
+    other = TaggedReplayBuffer(20, latent_dim=D, scratch_dir=tmp_path / "saved")
+    with pytest.raises(FileExistsError, match="not a replay buffer's to remove"):
+        other.add(camera.shoot(2), "success")
+    with pytest.raises(FileExistsError):
+        other.loads(tmp_path / "saved")
+    again = TaggedReplayBuffer(20, latent_dim=D)
+    again.loads(tmp_path / "saved")
+    assert len(again) == 3
+    # Nor a memory map of the user's own, which TensorDict marks alike.
+    TensorDict({"x": torch.ones(2)}, [2]).memmap(str(tmp_path / "mine" / "frames"))
+    with pytest.raises(FileExistsError):
+        TaggedReplayBuffer(20, latent_dim=D, scratch_dir=tmp_path / "mine").add(camera.shoot(2), "success")
+    assert TensorDict.load_memmap(str(tmp_path / "mine" / "frames"))["x"].sum() == 2
+
+
+@pytest.mark.parametrize("changes", [{"observation": ("latent", "x")}, {"reward": ("next", "loc", "r")}])
+def test_keys_above_or_below_the_buffers_own_are_refused(changes):
+    with pytest.raises(ValueError, match="are the buffer's own"):
+        TaggedReplayBuffer(20, keys=EpisodeKeys(**changes))

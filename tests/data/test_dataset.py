@@ -53,7 +53,7 @@ def test_nothing_is_written_when_one_set_is_faulty(tmp_path):
 
 
 def test_a_folder_without_description_is_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"holds no episodes.*collect\.py"):
+    with pytest.raises(FileNotFoundError, match=r"holds no episodes.*ls3 collect"):
         load_episodes(tmp_path)
 
 

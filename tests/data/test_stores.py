@@ -105,9 +105,9 @@ def test_a_dump_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_path):
     assert content(other) == [0, 1, 2, 3, 4]
     (tmp_path / "diary").mkdir()
     (tmp_path / "diary" / "today.txt").write_text("dear")
-    with pytest.raises(FileExistsError, match="files that no replay buffer has written"):
+    with pytest.raises(FileExistsError, match="not a replay buffer's to remove"):
         store.dumps(tmp_path / "diary")
-    with pytest.raises(FileExistsError, match="files that no replay buffer has written"):
+    with pytest.raises(FileExistsError, match="not a replay buffer's to remove"):
         RowStore(5, folder=tmp_path / "diary").extend(rows(0, 1))
     assert (tmp_path / "diary" / "today.txt").read_text() == "dear"
 

@@ -121,3 +121,9 @@ def test_under_bf16_autocast_only_the_hidden_layers_are_rounded():
     torch.testing.assert_close(rough, by_hand)
     torch.testing.assert_close(rough, exact, rtol=0.02, atol=0.02)
     assert not torch.equal(rough, exact)
+
+
+def test_no_rows_at_all_give_none():
+    network = EnsembleMLP(4, 2, num_members=3, hidden=(8,))
+    assert network(torch.zeros(0, 4)).shape == (0, 3, 2)
+    assert network(torch.zeros(2, 0, 3, 4), per_member=True).shape == (2, 0, 3, 2)

@@ -96,7 +96,7 @@ def test_data_of_another_task_are_refused_before_any_work(no_work, tmp_path):
         ("buffer.capacity=0", ValueError, r"^buffer\.capacity must be at least 1"),
         ("buffer.success_tail=0", ValueError, r"^buffer\.success_tail must be at least 1"),
         ("agent.latent_dim=0", ValueError, r"^agent\.latent_dim must be at least 1"),
-        ("data=/nowhere/at/all", FileNotFoundError, r"holds no episodes.*collect\.py"),
+        ("data=/nowhere/at/all", FileNotFoundError, r"holds no episodes.*ls3 collect"),
     ],
 )
 def test_impossible_settings_are_refused_before_any_work(no_work, tmp_path, override, error, message):
