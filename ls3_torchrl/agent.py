@@ -307,9 +307,8 @@ class LS3Agent(nn.Module):
         foreign = set(content.get("foreign", ()))
         if foreign != set(given):
             raise ValueError(
-                f"{path} holds an agent whose {', '.join(sorted(foreign)) or 'modules'} "
-                f"{'were given from outside' if foreign else 'are all its own'}; received modules for "
-                f"{', '.join(sorted(given)) or 'none'}. Pass modules={{name: module}} for just those from outside."
+                f"{path} holds an agent with modules from outside: {', '.join(sorted(foreign)) or 'none'}; received: "
+                f"{', '.join(sorted(given)) or 'none'}. Pass just those that it has, as modules={{name: module}}."
             )
         _check_shape(path, content["architecture"], expected)
         bounds = content.get("action_spec")

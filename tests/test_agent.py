@@ -297,13 +297,13 @@ def test_an_encoder_of_ones_own_takes_the_place_of_the_agents(tmp_path):
     loaded = LS3Agent.load(path, modules={"encoder": other})
     assert loaded.encoder is other
     assert torch.equal(other.module.weight, agent.encoder.module.weight)
-    with pytest.raises(ValueError, match=r"whose encoder were given from outside; received modules for none"):
+    with pytest.raises(ValueError, match=r"modules from outside: encoder; received: none"):
         LS3Agent.load(path)
 
 
 def test_modules_for_an_agent_that_has_its_own_are_refused(tmp_path):
     path = tiny().save(tmp_path / "agent.pt")
-    with pytest.raises(ValueError, match="are all its own; received modules for encoder"):
+    with pytest.raises(ValueError, match="modules from outside: none; received: encoder"):
         LS3Agent.load(path, modules={"encoder": reader()})
 
 

@@ -75,6 +75,11 @@ class LS3Trainer:
     ) -> None:
         self.agent, self.buffer = agent, buffer
         self.options = options = LS3Options() if options is None else options
+        if agent.architecture.latent_dim != buffer.latent_dim:
+            raise ValueError(
+                f"The agent's latents have size {agent.architecture.latent_dim}, the buffer's {buffer.latent_dim}. "
+                "Give both the same latent_dim."
+            )
         self.episode_length = episode_length
         self._failure_value: float | None = None  # made when it is first needed, once a phase
         if options.loss.monte_carlo and not buffer.continue_failures:

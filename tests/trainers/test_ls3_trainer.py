@@ -288,3 +288,8 @@ def test_a_copy_of_a_trainer_draws_from_a_buffer_of_its_own(make_agent, filled):
         for name in LEARNERS:
             with pytest.raises(TypeError):
                 other.learners[name].sample()
+
+
+def test_latents_of_another_size_than_the_buffers_are_refused_before_any_work(make_agent, filled):
+    with pytest.raises(ValueError, match=r"agent's latents have size 5, the buffer's 8"):
+        trainer_of(make_agent(latent_dim=5), filled(make_agent()))
