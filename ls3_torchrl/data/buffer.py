@@ -95,16 +95,19 @@ class TaggedReplayBuffer:
         scratch_dir: str | Path | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.latent_dim = require_at_least(latent_dim, 1, "latent_dim")
-        self.gamma = gamma
-        self.continue_failures = continue_failures
-        self.success_tail = None if success_tail is None else require_at_least(success_tail, 1, "success_tail")
+        # Plain numbers, whatever NumPy gave: a description on disk holds nothing else.
+        self.latent_dim = int(require_at_least(latent_dim, 1, "latent_dim"))
+        self.gamma = float(gamma)
+        self.continue_failures = bool(continue_failures)
+        self.success_tail = None if success_tail is None else int(require_at_least(success_tail, 1, "success_tail"))
         self.dynamics_after_violation = dynamics_after_violation
         self.device = torch.device(device)
         self.keys = keys or EpisodeKeys()
         self.extra_keys = tuple(unravel_key(key) for key in extra_keys)
         require_free((*self.keys.required, *self.extra_keys))
-        self._store = EpisodeStore(capacity, frame_capacity=frame_capacity, scratch_dir=scratch_dir, device=self.device)
+        self._store = EpisodeStore(
+            int(capacity), frame_capacity=frame_capacity, scratch_dir=scratch_dir, device=self.device
+        )
         self._views: dict[RowSelection, TensorDictReplayBuffer] = {}
         self._encoder: TensorDictModuleBase | None = None
         self._encoded = False

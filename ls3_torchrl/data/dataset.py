@@ -127,6 +127,7 @@ def save_episodes(
     if folder.exists():
         raise FileExistsError(f"{folder} exists already. Choose another folder, or remove it first.")
     lengths: dict[str, list[int]] = {}
+    datasets = {Tag.parse(tag): episodes for tag, episodes in datasets.items()}
     for tag, episodes in datasets.items():
         check_episodes(episodes, keys=keys, name=tag.name.lower())
         rows = _rows(episodes, tag.name.lower())

@@ -107,13 +107,13 @@ def with_members(target: Tensor, predicted: Tensor, who: str, *, trailing: int =
     Raises:
         ValueError: for another shape.
     """
-    expected = list(predicted.shape)
+    expected, given = list(predicted.shape), list(target.shape)
     if predicted.ndim == target.ndim + 1:
         target = target.unsqueeze(-1 - trailing)
         expected[-1 - trailing] = 1
     if list(target.shape) != expected:
         raise ValueError(
-            f"{who} compares targets of shape {list(target.shape)} with predictions of shape {list(predicted.shape)}. "
+            f"{who} compares targets of shape {given} with predictions of shape {list(predicted.shape)}. "
             "A module must predict [*B, ...] as its targets are, or [*B, M, ...] for M members."
         )
     return target

@@ -293,3 +293,10 @@ def test_each_episode_of_a_list_is_checked():
         check_episodes([good, bad])
     with pytest.raises(ValueError, match=r"each episode of a list must have batch size \[T\], got \[2, 2\]"):
         check_episodes([good, followed(2, 2)])
+
+
+def test_a_tag_may_be_its_name(tmp_path):
+    folder = save_episodes({"rand": episodes(1, 2)}, tmp_path / "demos", task="navigation", seed=0)
+    assert list(load_episodes(folder)) == [Tag.RAND]
+    with pytest.raises(ValueError, match="Unknown tag 'random'"):
+        save_episodes({"random": episodes(1, 2)}, tmp_path / "others", task="navigation", seed=0)

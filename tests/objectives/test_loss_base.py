@@ -314,3 +314,8 @@ def test_targets_get_a_dimension_for_members_where_there_are_some(target, predic
 def test_predictions_that_would_broadcast_into_nonsense_are_refused(target, predicted):
     with pytest.raises(ValueError, match=r"Loss compares targets of shape .* for M members"):
         with_members(torch.zeros(target), torch.zeros(predicted), "Loss")
+
+
+def test_an_error_names_the_shape_that_was_given():
+    with pytest.raises(ValueError, match=r"targets of shape \[3\] with predictions of shape \[3, 1\]"):
+        with_members(torch.zeros(3), torch.zeros(3, 1), "ALoss")
