@@ -1,4 +1,4 @@
-"""What all tests share: one seed, one thread, and a short training loop."""
+"""What all tests share: one seed, one thread, a short training loop, and how many inputs are made up for a property."""
 
 from __future__ import annotations
 
@@ -6,8 +6,17 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 from tensordict import TensorDictBase
 from torchrl.objectives import LossModule
+
+# The same inputs on every machine, and no clock: a slow day fails nothing. More of them, and others every time:
+# pytest --hypothesis-profile=deep.
+settings.register_profile(
+    "same", derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck), print_blob=True
+)
+settings.register_profile("deep", settings.get_profile("same"), derandomize=False, max_examples=5000)
+settings.load_profile("same")
 
 
 @pytest.fixture(autouse=True)
