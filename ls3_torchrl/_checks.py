@@ -9,6 +9,10 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 
+class DataWarning(UserWarning):
+    """Says what was converted in data of one's own, or what looks wrong in them although it may be meant."""
+
+
 def require_keys(tensordict: TensorDictBase, keys: Iterable[NestedKey], who: str) -> None:
     """Raise ``KeyError`` when ``tensordict`` lacks one of ``keys``, naming those that it has."""
     missing = [key for key in keys if tensordict.get(key, None) is None]

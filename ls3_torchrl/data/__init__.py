@@ -1,5 +1,6 @@
 """The data path: episodes and their keys, tags, labels, the two-store buffer, augmentation and files."""
 
+from ls3_torchrl._checks import DataWarning
 from ls3_torchrl.data.augment import random_perspective, random_resized_crop
 from ls3_torchrl.data.buffer import TaggedReplayBuffer
 from ls3_torchrl.data.dataset import check_episodes, load_episodes, save_episodes
@@ -20,6 +21,7 @@ from ls3_torchrl.data.tags import ALL_TAGS, VALUE_TAGS, Tag
 __all__ = [
     "ALL_TAGS",
     "VALUE_TAGS",
+    "DataWarning",
     "EpisodeKeys",
     "RowSelection",
     "Tag",
