@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import pickle
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,11 +13,11 @@ from typing import Any, Literal
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
 
-from ls3_torchrl._checks import require_at_least, require_choice
-from ls3_torchrl.files import save_atomically
+from ls3_torchrl._checks import action_bounds, require_at_least, require_choice
+from ls3_torchrl.files import load_verified, save_atomically
 from ls3_torchrl.modules import (
     ConstraintEstimator,
     EnsembleDynamics,
@@ -108,12 +107,8 @@ def _storable(name: str, value: Any) -> Any:
 
 
 def _one_action(spec: TensorSpec) -> Bounded:
-    """The bounds of one action, ``[A]``: of a batched spec, those of its first row."""
-    if not isinstance(spec, Bounded):
-        raise ValueError(f"Planning needs a bounded action spec, got {type(spec).__name__}.")
-    if not spec.shape:
-        raise ValueError("An action spec needs a dimension, [A]; got shape []. Give a single action as shape [1].")
-    low, high = (bound.reshape(-1, spec.shape[-1])[0].cpu() for bound in (spec.space.low, spec.space.high))
+    """The bounds of one action, ``[A]``, of a spec that may be batched."""
+    low, high = (bound.cpu() for bound in action_bounds(spec))
     return Bounded(low=low, high=high, shape=low.shape, dtype=spec.dtype)
 
 
@@ -269,7 +264,12 @@ class LS3Agent(nn.Module):
         return policy
 
     def save(self, path: str | Path) -> Path:
-        """Write weights and all that the agent was made for to one file; a half-written file never takes its place."""
+        """Write weights and all that the agent was made for to one file; a half-written file never takes its place.
+
+        Raises:
+            ValueError: for weights that are not finite, or a planner setting that a file cannot keep.
+        """
+        _require_finite(self.state_dict(), f"The agent is not saved to {path}")
         spec = self.action_spec
         content = {
             "format": FORMAT,
@@ -311,29 +311,41 @@ class LS3Agent(nn.Module):
                 f"{', '.join(sorted(given)) or 'none'}. Pass just those that it has, as modules={{name: module}}."
             )
         _check_shape(path, content["architecture"], expected)
-        bounds = content.get("action_spec")
-        spec = None
-        if bounds is not None:
-            spec = Bounded(**bounds, shape=bounds["low"].shape, dtype=bounds["low"].dtype)
-        agent = cls(
-            **content["architecture"],
-            **given,
-            action_spec=spec,
-            planner=content.get("planner"),
-            task=content.get("task"),
-        )
+        agent = cls._of(path, content, given)
         weights = content["state_dict"]
-        dtypes = {weight.dtype for weight in weights.values() if weight.is_floating_point()}
+        _require_finite(weights, str(path))
+        dtypes = {w.dtype for w in weights.values() if isinstance(w, Tensor) and w.is_floating_point()}
         agent.to(device=device, dtype=dtypes.pop() if len(dtypes) == 1 else None)
+        _require_dtypes(path, agent, weights)
         try:
             agent.load_state_dict(weights)
-        except RuntimeError as error:
+        except (RuntimeError, TypeError) as error:
             which = f"the modules that were given ({', '.join(given)}) or " if given else ""
             raise ValueError(
                 f"The weights in {path} do not fit {which}the file's own architecture: {error}. Give modules of the "
                 "shapes that were saved; if they are, the file is damaged."
             ) from error
         return agent
+
+    @classmethod
+    def _of(cls, path: Path, content: dict[str, Any], given: dict[str, TensorDictModuleBase]) -> LS3Agent:
+        """An agent with the settings of a file, and without its weights."""
+        bounds = content.get("action_spec")
+        try:
+            spec = None
+            if bounds is not None:
+                spec = Bounded(**bounds, shape=bounds["low"].shape, dtype=bounds["low"].dtype)
+            return cls(
+                **content["architecture"],
+                **given,
+                action_spec=spec,
+                planner=content.get("planner"),
+                task=content.get("task"),
+            )
+        except (TypeError, ValueError, KeyError, AttributeError, RuntimeError) as error:
+            raise ValueError(
+                f"{path} holds settings that no agent can have ({error}), so it is damaged. Use another copy of it."
+            ) from error
 
 
 def _versions() -> dict[str, str]:
@@ -348,15 +360,11 @@ def _versions() -> dict[str, str]:
 
 def _read(path: Path) -> dict[str, Any]:
     """The content of an agent file of this version or the one before."""
-    if not path.is_file():
-        raise FileNotFoundError(f"There is no agent at {path}.")
-    advice = f"{path} is not an agent file ({FORMAT}), or is damaged. Pass a file written by LS3Agent.save()."
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (EOFError, RuntimeError, pickle.UnpicklingError) as error:
-        raise ValueError(advice) from error
+    content = load_verified(path, f"an agent file ({FORMAT})")
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(advice)
+        raise ValueError(
+            f"{path} is not an agent file ({FORMAT}), or is damaged. Pass a file written by LS3Agent.save()."
+        )
     if content.get("version") == 1:
         warnings.warn(
             f"{path} is an agent file of version 1, which keeps neither bounds nor planner settings: pass them to "
@@ -368,7 +376,34 @@ def _read(path: Path) -> dict[str, Any]:
             f"{path} has version {content.get('version')}, but this library reads versions 1 and {VERSION}. "
             "Train again, or install the library version that wrote it."
         )
+    for name, kind in (("architecture", dict), ("state_dict", Mapping)):
+        if not isinstance(content.get(name), kind):
+            raise ValueError(
+                f"{path} is an agent file without {name}, or is damaged. Pass a file written by LS3Agent.save()."
+            )
     return content
+
+
+def _require_finite(weights: Mapping[str, Any], where: str) -> None:
+    """Refuse weights with which nobody can act."""
+    for name, weight in weights.items():
+        if isinstance(weight, Tensor) and weight.is_floating_point() and not weight.isfinite().all():
+            bad = int((~weight.isfinite()).sum())
+            raise ValueError(
+                f"{where}: {bad} of {weight.numel()} weights of {name} are NaN or infinite. Use an agent from before "
+                "its training diverged."
+            )
+
+
+def _require_dtypes(path: Path, agent: nn.Module, weights: Mapping[str, Any]) -> None:
+    """Refuse weights that loading would cast."""
+    for name, there in agent.state_dict().items():
+        weight = weights.get(name)
+        if isinstance(weight, Tensor) and weight.dtype != there.dtype:
+            raise ValueError(
+                f"{path} has {name} in {weight.dtype}, where {there.dtype} is needed. Give modules of the dtype that "
+                "was saved; if they are, the file is damaged."
+            )
 
 
 def _check_shape(path: Path, architecture: dict[str, Any], expected: dict[str, Any]) -> None:

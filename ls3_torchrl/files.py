@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
@@ -66,6 +67,43 @@ def save_text_atomically(text: str, path: str | Path) -> Path:
         'answer: 42'
     """
     return _write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def load_verified(path: str | Path, what: str) -> Any:
+    """Read a file of :func:`save_atomically` after its checksums; no code in it is run.
+
+    Args:
+        path: the file.
+        what: what it should be, for messages, such as "an agent file".
+
+    Raises:
+        FileNotFoundError: when there is none.
+        ValueError: for a damaged file, or one of another kind; the message names the file.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     load_verified(save_atomically({"answer": 42}, f"{folder}/file.pt"), "an example")
+        {'answer': 42}
+    """
+    path = Path(path)
+    if not path.is_file():
+        there = "it is a folder" if path.is_dir() else "there is no such file"
+        raise FileNotFoundError(f"{path} is not {what}: {there}. Check the path.")
+    try:
+        # PyTorch writes a checksum for every part of its archive, and does not look at them when it reads.
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"its part {damaged} does not match its checksum")
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever damage makes of a file
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise ValueError(
+            f"{path} is not {what}, or is damaged: {reason}. Use another copy of it, or make it anew."
+        ) from error
 
 
 def _write_atomically(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:

@@ -147,7 +147,7 @@ def test_weights_that_do_not_fit_are_refused(tmp_path):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no agent at .*agent\.pt"):
+    with pytest.raises(FileNotFoundError, match=r"agent\.pt is not an agent file.*no such file"):
         LS3Agent.load(tmp_path / "agent.pt")
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.objectives import SACLoss
 
-from ls3_torchrl.baselines.networks import action_bounds
+from ls3_torchrl._checks import action_bounds
 
 
 class AWACLoss(SACLoss):

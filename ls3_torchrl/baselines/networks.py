@@ -11,16 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.modules import MLP, ConvNet, ProbabilisticActor, TanhModule, TanhNormal, ValueOperator
 
-from ls3_torchrl._checks import require_at_least
-
-
-def action_bounds(action_spec: Bounded) -> tuple[Tensor, Tensor]:
-    """Lowest and highest action ``[A]``; of a batched spec, those of its first row."""
-    space = action_spec.space
-    low, high = (bound.reshape(-1, action_spec.shape[-1])[0] for bound in (space.low, space.high))
-    if not (torch.isfinite(low) & torch.isfinite(high) & (low < high)).all():
-        raise ValueError(f"Actions need finite bounds, low below high; got {low.tolist()} and {high.tolist()}.")
-    return low, high
+from ls3_torchrl._checks import action_bounds, require_at_least
 
 
 class PixelFeatures(nn.Module):

@@ -13,11 +13,11 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from torchrl.data import Bounded
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from ls3_torchrl._checks import require_keys, require_unit_interval
+from ls3_torchrl._checks import require_keys, require_labels, require_unit_interval
 from ls3_torchrl.baselines.networks import ObservedAction
 from ls3_torchrl.modules.call import call_with_params
 from ls3_torchrl.modules.ensemble import EnsembleMLP
-from ls3_torchrl.objectives.base import LatentLoss
+from ls3_torchrl.objectives.base import LatentLoss, require_shape_of
 
 
 class SafetyCritic(TensorDictModuleBase):
@@ -179,6 +179,8 @@ class SafetyCriticLoss(LatentLoss):
             rows = policy(rows)
             require_keys(rows, [keys.policy_action], "SafetyCriticLoss, of its policy,")
             risk = self._risk(self.target_safety_critic_params, after, rows.get(keys.policy_action))[1]
+        require_shape_of(constraint, risk, keys.constraint, "SafetyCriticLoss")
+        require_labels(constraint, keys.constraint)
         violated = constraint.to(risk)
         return violated + (1.0 - violated) * self.gamma * risk
 

@@ -1,6 +1,12 @@
 """Every piece of LS³ as a TensorDictModule."""
 
-from ls3_torchrl.modules.classifiers import ConstraintEstimator, GoalEstimator, LatentClassifier, SafeSet
+from ls3_torchrl.modules.classifiers import (
+    ConstraintEstimator,
+    GoalEstimator,
+    LatentClassifier,
+    SafeSet,
+    probability_of,
+)
 from ls3_torchrl.modules.dynamics import EnsembleDynamics
 from ls3_torchrl.modules.ensemble import EnsembleMLP
 from ls3_torchrl.modules.vae import PixelDecoder, PixelEncoder
@@ -16,4 +22,5 @@ __all__ = [
     "PixelEncoder",
     "SafeSet",
     "ValueEnsemble",
+    "probability_of",
 ]

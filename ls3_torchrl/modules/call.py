@@ -42,11 +42,6 @@ def call_on_latent(
     return call_with_params(network, params, entry, **options).get(network.out_keys[0])
 
 
-def probability(classifier: TensorDictModuleBase, latent: Tensor) -> Tensor:
-    """Probabilities ``[*B, 1]`` of latents ``[*B, D]``, by any module whose first output is a logit."""
-    return call_on_latent(classifier, latent).sigmoid()
-
-
 def _last(key: NestedKey) -> str:
     return key if isinstance(key, str) else key[-1]
 

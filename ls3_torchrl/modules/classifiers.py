@@ -10,8 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from ls3_torchrl._checks import require_keys
-from ls3_torchrl.modules.call import probability
+from ls3_torchrl._checks import require_keys, require_size
+from ls3_torchrl.modules.call import call_on_latent
 
 
 class LatentClassifier(TensorDictModuleBase):
@@ -33,6 +33,7 @@ class LatentClassifier(TensorDictModuleBase):
 
     Raises:
         KeyError: when the latent is missing.
+        ValueError: for a latent of another size.
 
     Example:
         >>> import torch
@@ -60,6 +61,7 @@ class LatentClassifier(TensorDictModuleBase):
         super().__init__()
         if logit_key is None:
             logit_key = "logit" if self.name is None else f"{self.name}_logit"
+        self.latent_dim = latent_dim
         self.in_keys = [latent_key]
         self.out_keys = [logit_key] if prob_key is None else [logit_key, prob_key]
         self.network: nn.Module = MLP(
@@ -69,7 +71,9 @@ class LatentClassifier(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the logit, and the probability where it was asked for."""
         require_keys(tensordict, self.in_keys, type(self).__name__)
-        logit: Tensor = self.network(tensordict.get(self.in_keys[0]))
+        latent = tensordict.get(self.in_keys[0])
+        require_size(latent, self.latent_dim, self.in_keys[0], type(self).__name__)
+        logit: Tensor = self.network(latent)
         tensordict.set(self.out_keys[0], logit)
         if len(self.out_keys) > 1:
             tensordict.set(self.out_keys[1], logit.sigmoid())
@@ -77,7 +81,7 @@ class LatentClassifier(TensorDictModuleBase):
 
     def probability(self, latent: Tensor) -> Tensor:
         """Probabilities ``[*B, 1]`` in [0, 1] of latents ``[*B, D]``."""
-        return probability(self, latent)
+        return call_on_latent(self, latent).sigmoid()
 
 
 class SafeSet(LatentClassifier):
@@ -126,3 +130,26 @@ class GoalEstimator(LatentClassifier):
 
     name = "goal"
     label_key = ("next", "success")
+
+
+def probability_of(classifier: TensorDictModuleBase, latent: Tensor) -> Tensor:
+    """Probabilities ``[*B, 1]`` of latents ``[*B, D]``, as the classifier itself would give them.
+
+    By its ``forward``, whose first output is a logit; by its ``probability`` where a subclass of
+    :class:`LatentClassifier` has redefined it.
+
+    Example:
+        >>> import torch
+        >>> from tensordict.nn import TensorDictModule
+        >>> own = TensorDictModule(torch.nn.Linear(8, 1), in_keys=["z"], out_keys=["any_logit"])
+        >>> probability_of(own, torch.zeros(4, 8)).shape
+        torch.Size([4, 1])
+    """
+    if isinstance(classifier, LatentClassifier) and redefines(classifier, LatentClassifier, "probability"):
+        return classifier.probability(latent)
+    return call_on_latent(classifier, latent).sigmoid()
+
+
+def redefines(module: object, base: type, method: str) -> bool:
+    """Whether a method of ``base`` means something else on ``module``: overridden by its class or set on itself."""
+    return method in vars(module) or getattr(type(module), method) is not getattr(base, method)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from ls3_torchrl._checks import require_choice, require_keys
+from ls3_torchrl._checks import require_choice, require_keys, require_size
 from ls3_torchrl.modules.ensemble import EnsembleMLP
 
 Propagation = Literal["ts1", "tsinf"]
@@ -40,7 +40,8 @@ class EnsembleDynamics(TensorDictModuleBase):
         control_affine: the change of the latent is affine in the action.
         action_scale: unit of the actions, one number or one for each of A; the networks see a / ``action_scale``. Half
             the action's range is a good one: a displacement of centimetres in metres is all but invisible to them.
-        log_scale_bounds: range that the log standard deviation is clamped to.
+        log_scale_bounds: range that the log standard deviation is clamped to. Outside it the gradient is that of the
+            soft bounds of Chua et al., at most one half: a network that has left the range can come back.
         latent_key: latent ``[*B, D]``.
         action_key: action ``[*B, A]``, in the environment's units.
         next_latent_key: where the imagined next latent ``[*B, D]`` is written.
@@ -48,7 +49,8 @@ class EnsembleDynamics(TensorDictModuleBase):
         noise_key: standard normal noise ``[*B, D]``; sampled when absent.
 
     Raises:
-        ValueError: for an unknown propagation, or an ``action_scale`` that is not positive or not of size A.
+        ValueError: for an unknown propagation, an ``action_scale`` that is not positive or not of size A, or latents
+            and actions of another size.
         KeyError: when latent or action is missing.
 
     Source: Chua et al., "Deep Reinforcement Learning in a Handful of Trials", section 5 and appendix.
@@ -104,6 +106,8 @@ class EnsembleDynamics(TensorDictModuleBase):
 
     def network_input(self, latent: Tensor, action: Tensor) -> Tensor:
         """What the network sees of a latent ``[*B, D]`` and an action ``[*B, A]``."""
+        require_size(latent, self.latent_dim, self.in_keys[0], "EnsembleDynamics")
+        require_size(action, self.action_dim, self.in_keys[1], "EnsembleDynamics")
         return latent if self.control_affine else torch.cat([latent, action / self.action_scale], -1)
 
     def read_output(self, output: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -122,7 +126,7 @@ class EnsembleDynamics(TensorDictModuleBase):
             )
             unit = (action / self.action_scale).unsqueeze(-2)
             delta = drift + (gain.unflatten(-1, (self.latent_dim, self.action_dim)) * unit).sum(-1)
-        return delta, log_scale.clamp(*self.log_scale_bounds)
+        return delta, _clamp(log_scale, *self.log_scale_bounds)
 
     def distribution(self, latent: Tensor, action: Tensor, *, per_member: bool = False) -> tuple[Tensor, Tensor]:
         """Every member's mean and standard deviation of the next latent.
@@ -184,3 +188,25 @@ class EnsembleDynamics(TensorDictModuleBase):
         index = members.unsqueeze(-1).expand(*members.shape, self.latent_dim)
         chosen = [value.gather(-2, index).squeeze(-2) for value in (loc, scale)]
         return tensordict.set(self.out_keys[0], chosen[0] + chosen[1] * noise)
+
+
+def _clamp(x: Tensor, low: float, high: float) -> Tensor:
+    if torch.is_grad_enabled() and x.requires_grad:
+        return _SoftBackward.apply(x, low, high)
+    return x.clamp(low, high)
+
+
+class _SoftBackward(torch.autograd.Function):
+    """Values clamped; outside the range the gradient of high − softplus(high − x) and low + softplus(x − low)."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, low: float, high: float) -> Tensor:
+        clamped = x.clamp(low, high)
+        ctx.save_for_backward(x, clamped)
+        return clamped
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        x, clamped = ctx.saved_tensors
+        outside = (x - clamped).abs()
+        return torch.where(outside > 0, grad * torch.sigmoid(-outside), grad), None, None

@@ -46,6 +46,18 @@ def as_unit_pixels(pixels: Tensor, dtype: torch.dtype = torch.float32) -> Tensor
     raise TypeError(f"Pixels must be uint8 in 0..255 or floating point in [0, 1], got {pixels.dtype}.")
 
 
+def _require_unit_range(pixels: Tensor) -> None:
+    if torch.compiler.is_compiling() or not pixels.numel():
+        return
+    low, high = (float(end) for end in pixels.detach().aminmax())
+    if low >= -0.01 and high <= 1.01:  # what interpolation may overshoot by
+        return
+    raise ValueError(
+        f"Images of {pixels.dtype} must lie in [0, 1]; received values from {low:.4g} to {high:.4g}. Give uint8 "
+        "images, or divide by 255."
+    )
+
+
 class _ConvolutionalPosterior(nn.Module):
     """Images to the mean and standard deviation of q(z|s)."""
 
@@ -79,6 +91,8 @@ class _ConvolutionalPosterior(nn.Module):
             )
         dtype = self.head.weight.dtype
         images = as_unit_pixels(pixels, dtype)
+        if pixels.is_floating_point():
+            _require_unit_range(pixels)
         batch = images.shape[:-3]
         images = images.reshape(-1, *images.shape[-3:]).contiguous(memory_format=torch.channels_last)
         # Not in the lower precision of autocast: it cannot tell means that are close together.
@@ -103,7 +117,7 @@ class PixelEncoder(ProbabilisticTensorDictSequential):
         latent_key: where the latent ``[*B, D]`` is written.
 
     Raises:
-        ValueError: for a wrong image shape or images that are not finite.
+        ValueError: for a wrong image shape, or images that are not finite or, as floats, not in [0, 1].
         TypeError: for a dtype other than uint8 and floating point.
 
     Example:

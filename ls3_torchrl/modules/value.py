@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from ls3_torchrl._checks import require_keys
+from ls3_torchrl._checks import require_keys, require_size
 from ls3_torchrl.modules.ensemble import EnsembleMLP
 
 
@@ -27,6 +27,7 @@ class ValueEnsemble(TensorDictModuleBase):
 
     Raises:
         KeyError: when the latent is missing.
+        ValueError: for a latent of another size.
 
     Example:
         >>> import torch
@@ -47,7 +48,7 @@ class ValueEnsemble(TensorDictModuleBase):
         value_key: NestedKey = "state_value",
     ) -> None:
         super().__init__()
-        self.num_members = num_members
+        self.latent_dim, self.num_members = latent_dim, num_members
         self.in_keys = [latent_key]
         self.out_keys = [value_key]
         self.network = EnsembleMLP(latent_dim, 1, num_members=num_members, hidden=hidden)
@@ -57,5 +58,7 @@ class ValueEnsemble(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase, *, per_member: bool = False) -> TensorDictBase:
         """Write every member's value of the latent."""
         require_keys(tensordict, self.in_keys, "ValueEnsemble")
-        value = self.network(tensordict.get(self.in_keys[0]), per_member=per_member)
+        latent = tensordict.get(self.in_keys[0])
+        require_size(latent, self.latent_dim, self.in_keys[0], "ValueEnsemble")
+        value = self.network(latent, per_member=per_member)
         return tensordict.set(self.out_keys[0], value)

@@ -119,6 +119,15 @@ def with_members(target: Tensor, predicted: Tensor, who: str, *, trailing: int =
     return target
 
 
+def require_shape_of(target: Tensor, predicted: Tensor, key: NestedKey, who: str) -> None:
+    """Raise ``ValueError`` for a target that would be broadcast: each row would learn from those of others."""
+    if target.shape != predicted.shape:
+        raise ValueError(
+            f"{who} compares {key!r} of shape {list(target.shape)} with predictions of shape {list(predicted.shape)}. "
+            "Give one target for each prediction: [B, 1], not [B]."
+        )
+
+
 def check_members(latent: Tensor, module: TensorDictModuleBase, who: str) -> None:
     """Raise ``ValueError`` unless ``latent`` is a bootstrap batch ``[B, M, D]`` for the M members of ``module``."""
     members = module.num_members

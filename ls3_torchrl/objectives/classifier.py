@@ -9,9 +9,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from ls3_torchrl._checks import require_labels
 from ls3_torchrl.modules.call import call_on_latent
 from ls3_torchrl.modules.classifiers import LatentClassifier, SafeSet
-from ls3_torchrl.objectives.base import LatentLoss
+from ls3_torchrl.objectives.base import LatentLoss, require_shape_of
 
 
 class ClassifierLoss(LatentLoss):
@@ -29,7 +30,7 @@ class ClassifierLoss(LatentLoss):
 
     Raises:
         TypeError: for a safe set, which has no labels.
-        ValueError: for labels of another shape than the logits.
+        ValueError: for labels of another shape than the logits, or other labels than 0 to 1.
         KeyError: when a key is missing.
 
     Example:
@@ -77,6 +78,8 @@ class ClassifierLoss(LatentLoss):
         keys = self.tensor_keys
         label = tensordict.get(keys.label)
         logit = call_on_latent(self.classifier, tensordict.get(keys.latent))
+        require_shape_of(label, logit, keys.label, f"ClassifierLoss of {self.name!r}")
+        require_labels(label, keys.label)
         hits = ((logit.detach() > 0) == label.bool()).float()
         return {
             f"loss_{self.name}": binary_cross_entropy_with_logits(logit, label.to(logit)),

@@ -10,9 +10,9 @@ from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from ls3_torchrl._checks import require_unit_interval
+from ls3_torchrl._checks import require_labels, require_unit_interval
 from ls3_torchrl.modules.call import call_on_latent
-from ls3_torchrl.objectives.base import LatentLoss
+from ls3_torchrl.objectives.base import LatentLoss, require_shape_of
 
 
 class SafeSetLoss(LatentLoss):
@@ -32,7 +32,8 @@ class SafeSetLoss(LatentLoss):
         The scalar ``loss_safe_set``.
 
     Raises:
-        ValueError: for γ_S outside [0, 1].
+        ValueError: for γ_S outside [0, 1], labels or weights of another shape than the logits, labels other than 0 to
+            1, or negative weights.
         KeyError: when a key is missing.
 
     Example:
@@ -79,6 +80,8 @@ class SafeSetLoss(LatentLoss):
         """max(1_S(z_t), γ_S f_S'(z_{t+1})), a probability ``[B, 1]``."""
         with torch.no_grad():
             next_safe = call_on_latent(self.safe_set, next_latent, params=self.target_safe_set_params).sigmoid()
+        require_shape_of(in_success, next_safe, self.tensor_keys.in_success, "SafeSetLoss")
+        require_labels(in_success, self.tensor_keys.in_success)
         return torch.maximum(in_success.to(next_safe), self.gamma * next_safe)
 
     def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
@@ -87,4 +90,10 @@ class SafeSetLoss(LatentLoss):
         target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.in_success))
         weight = tensordict.get(keys.weight, None)
         logit = call_on_latent(self.safe_set, tensordict.get(keys.latent), params=self.safe_set_params)
+        if weight is not None:
+            require_shape_of(weight, logit, keys.weight, "SafeSetLoss")
+            if not torch.compiler.is_compiling() and (weight < 0).any():
+                raise ValueError(
+                    f"SafeSetLoss needs weights {keys.weight!r} of at least 0, got {weight.min().item():.4g}."
+                )
         return {"loss_safe_set": binary_cross_entropy_with_logits(logit, target, weight)}

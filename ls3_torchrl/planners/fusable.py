@@ -7,11 +7,11 @@ from typing import cast
 from torch import nn
 
 from ls3_torchrl.layers import is_relu_mlp
-from ls3_torchrl.modules.classifiers import LatentClassifier
+from ls3_torchrl.modules.classifiers import LatentClassifier, redefines
 from ls3_torchrl.modules.dynamics import EnsembleDynamics
 from ls3_torchrl.modules.ensemble import EnsembleMLP
 from ls3_torchrl.modules.value import ValueEnsemble
-from ls3_torchrl.planners.latent_env import LatentEnv, redefines
+from ls3_torchrl.planners.latent_env import LatentEnv
 
 #: Methods whose work is done from the snapshot: where one of them is overridden, it would be bypassed.
 _METHODS: dict[type, tuple[str, ...]] = {

@@ -11,7 +11,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ls3_torchrl.modules.call import call_on_latent
-from ls3_torchrl.planners.latent_env import LatentEnv, probability_of
+from ls3_torchrl.modules.classifiers import probability_of
+from ls3_torchrl.planners.latent_env import LatentEnv
 from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction
 
 

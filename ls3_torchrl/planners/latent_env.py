@@ -7,13 +7,12 @@ from itertools import chain
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import ModelBasedEnvBase
 
-from ls3_torchrl._checks import require_at_least
-from ls3_torchrl.modules.call import call_on_latent
-from ls3_torchrl.modules.classifiers import LatentClassifier
+from ls3_torchrl._checks import action_bounds, require_at_least, require_module
+from ls3_torchrl.modules.classifiers import probability_of
 
 
 class LatentEnv(ModelBasedEnvBase):
@@ -69,6 +68,8 @@ class LatentEnv(ModelBasedEnvBase):
         reward_key: NestedKey = "reward",
         device: torch.device | str | None = None,
     ) -> None:
+        for name, module in (("dynamics", dynamics), ("constraint", constraint), ("goal", goal)):
+            require_module(module, name)
         latent_dim = getattr(dynamics, "latent_dim", None) if latent_dim is None else latent_dim
         if latent_dim is None:
             raise ValueError(f"{type(dynamics).__name__} does not say how large its latents are: give latent_dim.")
@@ -176,27 +177,8 @@ class LatentEnv(ModelBasedEnvBase):
         """Imagination draws from torch's global generator."""
 
 
-def probability_of(classifier: nn.Module, latent: Tensor) -> Tensor:
-    """Probabilities ``[*B, 1]`` of latents ``[*B, D]``, as the classifier itself would give them.
-
-    By its ``forward``, whose first output is a logit; by its ``probability`` where a subclass of
-    :class:`~ls3_torchrl.modules.LatentClassifier` has redefined it.
-    """
-    if isinstance(classifier, LatentClassifier) and redefines(classifier, LatentClassifier, "probability"):
-        return classifier.probability(latent)
-    return call_on_latent(classifier, latent).sigmoid()
-
-
-def redefines(module: object, base: type, method: str) -> bool:
-    """Whether a method of ``base`` means something else on ``module``: overridden by its class or set on itself."""
-    return method in vars(module) or getattr(type(module), method) is not getattr(base, method)
-
-
 def _check_action_spec(spec: TensorSpec, action_dim: int | None) -> None:
-    if not isinstance(spec, Bounded):
-        raise ValueError(f"Planning needs a bounded action spec, got {type(spec).__name__}.")
-    if not spec.dtype.is_floating_point:
-        raise ValueError(f"Planning needs an action spec of a floating dtype, got {spec.dtype}.")
+    action_bounds(spec)
     if len(spec.shape) != 1 or action_dim not in (None, spec.shape[-1]):
         expected = "A" if action_dim is None else action_dim
         raise ValueError(

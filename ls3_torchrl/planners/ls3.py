@@ -17,10 +17,11 @@ from ls3_torchrl._checks import (
     require_choice,
     require_finite,
     require_keys,
+    require_module,
     require_probability,
 )
 from ls3_torchrl.layers import Precision
-from ls3_torchrl.modules.call import posterior_keys
+from ls3_torchrl.modules.call import call_on_latent, posterior_keys
 from ls3_torchrl.planners.cem import optimizer_or_default
 from ls3_torchrl.planners.decisions import Decisions
 from ls3_torchrl.planners.engine import Engine, EngineName
@@ -41,6 +42,7 @@ from ls3_torchrl.planners.scoring import (
     feasible,
     least_harm,
     objective,
+    require_sound,
 )
 from ls3_torchrl.planners.warm_start import WarmStart
 
@@ -104,8 +106,12 @@ class LS3Planner(MPCPlannerBase):
         out then, as it does every module that lacks an input.
 
     Raises:
-        ValueError: for settings out of range; by the call, for an observation that is not finite.
-        TypeError: for unknown settings, an optimiser that is none, or modules that ``engine="fused"`` would bypass.
+        ValueError: for settings out of range, or modules of another latent size; by the call, for an observation that
+            is not finite.
+        TypeError: for unknown settings, an optimiser or modules that are none, or modules that ``engine="fused"`` would
+            bypass.
+        FloatingPointError: by the call, when the networks give no plan of a row a finite rating: it never acts at
+            random. Single plans that overflow rank last.
         KeyError: by the call, when the encoder's input is missing.
 
     Example:
@@ -166,6 +172,7 @@ class LS3Planner(MPCPlannerBase):
         self.noise_scale = _not_negative(noise_scale, "noise_scale")
         self.common_noise = common_noise
         self.value, self.safe_set, self.encoder = value, safe_set, encoder
+        self._require_modules()
         self.engine = Engine(
             model,
             value,
@@ -186,6 +193,22 @@ class LS3Planner(MPCPlannerBase):
         warm_keys = self.warm_start.in_keys if self.optimizer.uses_warm_start else []
         self.in_keys = [*self._observation_keys, *warm_keys]
         self.out_keys = [self.action_key, *self.decisions.keys.values(), *self.warm_start.out_keys]
+
+    def _require_modules(self) -> None:
+        """Find what does not fit by calling every head once, rather than in the first plan."""
+        for name, module in (("value", self.value), ("safe_set", self.safe_set), ("encoder", self.encoder)):
+            if name != "encoder" or module is not None:
+                require_module(module, name)
+        heads = {
+            "value": self.value,
+            "safe_set": self.safe_set,
+            "constraint": self.env.constraint,
+            "goal": self.env.goal,
+        }
+        latent = torch.zeros(1, self.env.latent_dim, device=self.env.device, dtype=self.env.latent_dtype)
+        for name, head in heads.items():
+            with torch.no_grad(), torch.random.fork_rng(enabled=True, devices=[]):
+                _call_once(name, head, latent)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """The transform that carries the warm start from step to step and resets it with the episode.
@@ -225,13 +248,23 @@ class LS3Planner(MPCPlannerBase):
             return torch.zeros(*tensordict.batch_size, self.env.latent_dim, device=self.action_spec.device)
         if self.encoder is None:
             latent = tensordict.get(self.latent_key)
+            self._require_latent(latent, tensordict)
         else:
             for key in self._observation_keys:
                 require_finite(tensordict.get(key), f"The observation {key!r}")
             with set_interaction_type(InteractionType.DETERMINISTIC):
                 latent = self.encoder(tensordict.select(*self._observation_keys)).get(self.latent_key)
+            self._require_latent(latent, tensordict)
         require_finite(latent, "The latent to plan from")
         return latent.float()
+
+    def _require_latent(self, latent: Tensor, tensordict: TensorDictBase) -> None:
+        if latent.shape[-1] != self.env.latent_dim or latent.shape[: tensordict.ndim] != tensordict.batch_size:
+            raise ValueError(
+                f"The latent {self.latent_key!r} to plan from has shape {list(latent.shape)}, but the dynamics need "
+                f"[*B, {self.env.latent_dim}] with the batch {list(tensordict.batch_size)} in front. Use the encoder "
+                "that the dynamics were trained on."
+            )
 
     def score_plans(self, statistics: PlanStatistics, threshold: Tensor) -> PlanScores:
         """Objective, feasibility and fallback ranking of candidates under δ_S ``[b, 1]``."""
@@ -267,7 +300,10 @@ class LS3Planner(MPCPlannerBase):
                 sampled = noise.of_iteration(iteration, rows)
             threshold = self._threshold(restarts).unsqueeze(-1)
             limits = Limits(threshold, self.constraint_threshold)
-            return self.score_plans(imagine(latent[rows], actions, sampled, limits), threshold)
+            statistics = imagine(latent[rows], actions, sampled, limits)
+            scores = self.score_plans(statistics, threshold)
+            require_sound(statistics, scores)
+            return scores
 
         def given(rows: Tensor, iteration: int) -> tuple[Tensor, ...]:
             assert noise is not None
@@ -307,6 +343,7 @@ class LS3Planner(MPCPlannerBase):
         rows = batch.numel()
         mean, std = self._read_warm_start(tensordict, rows)
         result = self.plan(latent.reshape(rows, latent.shape[-1]), mean, std, noise)
+        require_finite(result.actions, f"The plan of {type(self.optimizer).__name__}")
         space = self.action_spec.space
         # Once more, in the spec's own dtype: a bound of it may lie between two numbers of float32.
         action = result.actions[:, 0].to(self.action_spec.dtype).clamp(space.low, space.high)
@@ -352,3 +389,21 @@ def _not_negative(value: float, name: str) -> float:
     if not value >= 0.0:
         raise ValueError(f"{name} must not be negative, got {value}.")
     return value
+
+
+def _call_once(name: str, head: TensorDictModuleBase, latent: Tensor) -> None:
+    """Refuse a head that cannot read such latents, or writes anything but one number or one for each member."""
+    try:
+        out = call_on_latent(head, latent)
+    except (RuntimeError, KeyError, IndexError) as error:
+        raise ValueError(
+            f"{name} ({type(head).__name__}) cannot read latents of size {latent.shape[-1]}, which the dynamics have: "
+            f"{' '.join(str(error).split())[:150]}. Make all networks for one latent_dim."
+        ) from error
+    shapes = [1, 1], [1, out.shape[1] if out.ndim > 1 else 0, 1]
+    if list(out.shape) not in (shapes if name == "value" else shapes[:1]):
+        allowed = "[*B, 1], or [*B, M, 1] of M members" if name == "value" else "[*B, 1]"
+        raise ValueError(
+            f"{name} ({type(head).__name__}) must write {allowed} as its first output; for a latent [1, "
+            f"{latent.shape[-1]}] it wrote {list(out.shape)}."
+        )

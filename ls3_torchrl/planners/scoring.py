@@ -7,6 +7,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from ls3_torchrl.planners.optimizer import PlanScores
+
 ConstraintReduction = Literal["max", "mean"]
 GoalReduction = Literal["count", "expected"]
 SafeSetReduction = Literal["mean", "min"]
@@ -62,10 +64,47 @@ def feasible(statistics: PlanStatistics, *, safe_set_threshold: Tensor | float, 
 def least_harm(statistics: PlanStatistics, *, constraint_threshold: float) -> Tensor:
     """Ranking for when nothing is feasible, ``[*B, N]``: fewest violating steps, then the safest end.
 
+    NaN where a probability is: nobody knows what such a plan would do.
+
     Args:
         statistics: of the candidates.
         constraint_threshold: δ_C.
     """
     violations = (statistics.constraint_prob > constraint_threshold).sum(-1)
+    unknown = statistics.constraint_prob.isnan().any(-1)
     # A probability of at most one half of a step keeps the order lexicographic.
-    return torch.as_tensor(0.5 * statistics.safe_set_prob - violations)
+    return (0.5 * statistics.safe_set_prob - violations).masked_fill(unknown, torch.nan)
+
+
+def require_sound(statistics: PlanStatistics, scores: PlanScores) -> None:
+    """Refuse to choose among plans of which nothing is known.
+
+    Single plans may be lost to overflow; they rank last. Where all plans of a row are, or the value of all its feasible
+    ones, any choice would be a random one.
+
+    Args:
+        statistics: of the candidates.
+        scores: what the planner made of them.
+
+    Raises:
+        FloatingPointError: naming what is not finite.
+    """
+    unknown = scores.fallback.isnan().all(-1)
+    unvalued = scores.feasible.any(-1) & ~(scores.feasible & scores.score.isfinite()).any(-1)
+    if not (unknown | unvalued).any():
+        return
+    wrong = []
+    if unknown.any():
+        rows = unknown.nonzero().flatten()
+        parts = {"constraint estimator": statistics.constraint_prob, "safe set": statistics.safe_set_prob}
+        wrong = [f"the {name}'s probabilities" for name, part in parts.items() if part[rows].isnan().any()]
+        if len(wrong) == 2:
+            wrong = ["the imagined latents (or both classifiers)"]
+    else:
+        rows = unvalued.nonzero().flatten()
+        wrong = ["the value (or the goal estimator's probabilities)"]
+    raise FloatingPointError(
+        f"No plan can be judged in {len(rows)} of {len(unknown)} rows, the first being {int(rows[0])}: {wrong[0]} are "
+        "not finite for all candidates. The networks' weights are not finite, or their outputs overflow: load weights "
+        "from before the training diverged."
+    )

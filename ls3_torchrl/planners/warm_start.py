@@ -55,14 +55,29 @@ class WarmStart:
         return TensorDictPrimer(spec, default_value=0.0, expand_specs=True)
 
     def read(self, tensordict: TensorDictBase, rows: int) -> tuple[Tensor | None, Tensor | None]:
-        """Mean and standard deviation ``[rows, H, A]``; those of the whole box for rows that begin an episode."""
+        """Mean and standard deviation ``[rows, H, A]``; those of the whole box for rows that begin an episode.
+
+        Also for rows in which they are no Gaussian, not finite or of negative width: a plan must not inherit it.
+
+        Raises:
+            ValueError: for another horizon, or another number of actions.
+        """
         mean, std = (tensordict.get(key, None) for key in self.keys.values())
         if mean is None or std is None:
             return None, None
+        expected = (self.horizon, self.middle.shape[-1])
+        if mean.shape[-2:] != expected or std.shape != mean.shape or mean.shape[:-2].numel() != rows:
+            raise ValueError(
+                f"The last plan under {list(self.keys.values())} has shapes {list(mean.shape)} and {list(std.shape)}, "
+                f"but this planner's are [*B, {expected[0]}, {expected[1]}] for {rows} rows. Leave out a plan of "
+                "another planner."
+            )
         mean = mean.reshape(rows, *mean.shape[-2:]).float()
         std = std.reshape(rows, *std.shape[-2:]).float()
         is_init = tensordict.get(self.is_init_key, None)
         fresh = (std == 0).all(-1, keepdim=True).all(-2, keepdim=True)
+        broken = ~(mean.isfinite() & std.isfinite() & (std >= 0))
+        fresh = fresh | broken.any(-1, keepdim=True).any(-2, keepdim=True)
         if is_init is not None:
             fresh = fresh | is_init.reshape(rows, 1, 1)
         return torch.where(fresh, self.middle, mean), torch.where(fresh, self.wide, std)

@@ -14,8 +14,8 @@ from tensordict.nn import (
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from ls3_torchrl.modules import PixelEncoder, SafeSet, ValueEnsemble
-from ls3_torchrl.modules.call import call_on_latent, call_with_params, encode, posterior_keys, probability
+from ls3_torchrl.modules import PixelEncoder, SafeSet, ValueEnsemble, probability_of
+from ls3_torchrl.modules.call import call_on_latent, call_with_params, encode, posterior_keys
 
 
 def module(out_keys: list, in_keys: list | None = None) -> TensorDictModule:
@@ -42,7 +42,7 @@ def test_the_first_of_several_outputs():
     safe_set = SafeSet(8, hidden=(16,), prob_key="p")
     latent = torch.randn(4, 8)
     assert torch.equal(call_on_latent(safe_set, latent), safe_set.network(latent))
-    assert torch.equal(probability(safe_set, latent), safe_set.network(latent).sigmoid())
+    assert torch.equal(probability_of(safe_set, latent), safe_set.network(latent).sigmoid())
 
 
 def test_options_reach_the_network():

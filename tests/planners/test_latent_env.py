@@ -247,7 +247,7 @@ def test_it_imagines_where_its_dynamics_are_if_nothing_else_is_said():
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        (Unbounded(shape=(A,)), "bounded action spec, got Unbounded"),
+        (Unbounded(shape=(A,)), "need a bounded spec, got Unbounded"),
         (Bounded(low=-1.0, high=1.0, shape=(5, A)), r"must have shape \[2\].*got \[5, 2\].*one row"),
         (Bounded(low=-1.0, high=1.0, shape=(3,)), r"must have shape \[2\].*got \[3\]"),
         (Bounded(low=-1, high=1, shape=(A,), dtype=torch.int64), "floating dtype, got torch.int64"),

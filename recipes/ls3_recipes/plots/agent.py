@@ -16,6 +16,7 @@ from ls3_recipes.plots.style import GOAL, INK, PALE, SAFE, UNSAFE, Axes, grid, i
 from ls3_recipes.run_settings import RunSettings
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag
+from ls3_torchrl.modules import probability_of
 from ls3_torchrl.planners import LS3Planner
 
 
@@ -83,13 +84,13 @@ def agent_fields(env: VisualConstraintEnv, agent: LS3Agent, planner: LS3Planner)
     """Value, spread of the values, safe set, constraint and goal."""
     latent = over_plane(env, lambda pixels: _encode(agent, pixels))["latent"]
     values = _values(agent, latent)
-    safe, unsafe = agent.safe_set.probability(latent), agent.constraint.probability(latent)
+    safe, unsafe = probability_of(agent.safe_set, latent), probability_of(agent.constraint, latent)
     return {
         "Value V": Field(values.mean(-1), "viridis"),
         "Spread of V over members": Field(values.std(-1), "magma"),
         "Safe set $f_S$": Field(safe, "BuGn", (0.0, 1.0), planner.safe_set_threshold),
         "Constraint $f_C$": Field(unsafe, "OrRd", (0.0, 1.0), planner.constraint_threshold),
-        "Goal $f_G$": Field(agent.goal.probability(latent), "Blues", (0.0, 1.0), 0.5),
+        "Goal $f_G$": Field(probability_of(agent.goal, latent), "Blues", (0.0, 1.0), 0.5),
     }
 
 
@@ -206,7 +207,7 @@ def _plot_heads(axis: Axes, agent: LS3Agent, planner: LS3Planner, latent: Tensor
     time = np.arange(1, len(latent) + 1)
     heads = ((agent.safe_set, "safe set", SAFE), (agent.constraint, "constraint", UNSAFE), (agent.goal, "goal", GOAL))
     for head, name, colour in heads:
-        axis.plot(time, head.probability(latent).flatten().cpu().numpy(), color=colour, lw=1.4, label=name)
+        axis.plot(time, probability_of(head, latent).flatten().cpu().numpy(), color=colour, lw=1.4, label=name)
     for level, colour in ((planner.safe_set_threshold, SAFE), (planner.constraint_threshold, UNSAFE)):
         axis.axhline(level, color=colour, lw=0.7, ls=":")
     axis.set(ylim=(-0.03, 1.03), xlabel="step")
