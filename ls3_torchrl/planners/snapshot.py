@@ -53,16 +53,31 @@ class Snapshot:
     def _heads(self) -> dict[str, nn.Module]:
         return {"constraint": self._env.constraint, "goal": self._env.goal, "safe_set": self._safe_set}
 
+    def _require_finite(self) -> None:
+        """Refuse weights that are not finite: the fused layers' ReLU makes a plausible 0 of NaN."""
+        modules = {"dynamics": self._env.dynamics, "value": self._value, **self._heads}
+        for name, module in modules.items():
+            if not torch.stack([p.detach().float().sum() for p in module.parameters()]).isfinite().all():
+                raise FloatingPointError(
+                    f"Weights of {name} are not finite, so no plan can be judged. Load weights from before its training "
+                    "diverged."
+                )
+
     def _parameters(self) -> Iterable[nn.Parameter]:
         for module in (self._env.dynamics, self._env.constraint, self._env.goal, self._value, self._safe_set):
             yield from module.parameters()
 
     def refresh(self) -> bool:
-        """Copy the layers anew if a parameter changed; return whether it had."""
+        """Copy the layers anew if a parameter changed; return whether it had.
+
+        Raises:
+            FloatingPointError: for weights that are not finite.
+        """
         # Values are compared: fused optimisers change parameters without raising their version counter.
         parameters = list(self._parameters())
         if len(parameters) == len(self._seen) and all(map(_same, parameters, self._seen)):
             return False
+        self._require_finite()
         device = parameters[0].device
         chosen = fastest_precision(device.type) if self._precision == "auto" else self._precision
         self.dtype = torch.bfloat16 if chosen == "bf16" else torch.float32

@@ -265,3 +265,48 @@ def test_it_computes_in_the_dtype_it_was_moved_to(dtype: torch.dtype, control_af
     tolerance = 1e-5 if dtype == torch.float64 else 0.05
     torch.testing.assert_close(after, before.to(dtype), atol=tolerance, rtol=tolerance)
     assert dynamics(moved.exclude("dynamics_noise", "dynamics_member"))["next", "latent"].dtype == dtype
+
+
+def test_a_log_scale_outside_its_range_gets_the_gradient_of_soft_bounds():
+    low, high = -2.0, 1.0
+    dynamics = EnsembleDynamics(1, 1, num_members=1, hidden=(), log_scale_bounds=(low, high))
+    for x in (-5.0, -2.5, -1.0, 0.5, 1.25, 4.0):
+        output = torch.tensor([[0.0, x]], requires_grad=True)
+        _, log_scale = dynamics.read_output(output, torch.zeros(1, 1))
+        assert log_scale.item() == min(max(x, low), high)  # the value is clamped
+        (gradient,) = torch.autograd.grad(log_scale.sum(), output)
+        soft = torch.tensor(x, dtype=torch.float64, requires_grad=True)
+        bounded = (
+            high - torch.nn.functional.softplus(high - soft)
+            if x > high
+            else low + torch.nn.functional.softplus(soft - low)
+        )
+        (expected,) = torch.autograd.grad(bounded, soft)
+        assert gradient[0, 1].item() == pytest.approx(1.0 if low <= x <= high else expected.item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("start", [8.0, -14.0])
+def test_a_log_scale_that_has_left_its_range_comes_back(start):
+    # With the gradient of a plain clamp, which is 0 there, this network would never change again.
+    dynamics = EnsembleDynamics(1, 1, num_members=1, hidden=())
+    with torch.no_grad():
+        dynamics.network.weights[0].zero_()
+        dynamics.network.biases[0].copy_(torch.tensor([[[0.0, start]]]))
+    optimizer = torch.optim.Adam(dynamics.parameters(), 0.1)
+    z = torch.zeros(64, 1)
+    target = torch.randn(64, 1)
+    for _ in range(400):
+        loc, scale = dynamics.distribution(z, z)
+        loss = -torch.distributions.Normal(loc.squeeze(-2), scale.squeeze(-2)).log_prob(target).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert abs(dynamics.network.biases[0][0, 0, 1].item()) < 1.0  # the log of the standard deviation of the targets, 0
+
+
+@pytest.mark.parametrize(("latent", "action", "named"), [((4, 3), (4, 2), "latent"), ((4, 2), (4, 3), "action")])
+def test_latents_and_actions_of_another_size_are_refused_by_name(latent, action, named):
+    dynamics = EnsembleDynamics(2, 2, num_members=2, hidden=(4,))
+    td = TensorDict({"latent": torch.zeros(latent), "action": torch.zeros(action)}, [4])
+    with pytest.raises(ValueError, match=rf"EnsembleDynamics reads '{named}' of shape \[\*B, 2\], got \[4, 3\]"):
+        dynamics(td)

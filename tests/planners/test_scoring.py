@@ -1,6 +1,8 @@
+import pytest
 import torch
 
-from ls3_torchrl.planners import PlanStatistics, feasible, least_harm, objective
+from ls3_torchrl.planners import PlanScores, PlanStatistics, feasible, least_harm, objective
+from ls3_torchrl.planners.scoring import require_sound
 
 
 def statistics(value=((0.0,),), goal=((0.0,),), constraint=((0.0,),), safe=(1.0,)):
@@ -81,3 +83,58 @@ def test_least_harm_is_lexicographic_for_any_probabilities():
     ranking = least_harm(PlanStatistics(torch.zeros(300, 1), constraint, constraint, safe), constraint_threshold=0.3)
     keys = list(zip((-(constraint > 0.3).sum(-1)).tolist(), safe.tolist(), strict=True))
     assert ranking.argsort(descending=True).tolist() == sorted(range(300), key=keys.__getitem__, reverse=True)
+
+
+# --- nothing is known of a plan ---------------------------------------------------------------------------------
+
+
+def judged(statistics, threshold=0.8):
+    allowed = feasible(statistics, safe_set_threshold=threshold, constraint_threshold=0.2)
+    return PlanScores(objective(statistics), allowed, least_harm(statistics, constraint_threshold=0.2))
+
+
+def three_plans(**changes):
+    """One row of three plans over two steps: the first is feasible."""
+    parts = {
+        "value": torch.tensor([[[-1.0], [-2.0], [-3.0]]]),
+        "goal_prob": torch.zeros(1, 3, 2),
+        "constraint_prob": torch.tensor([[[0.1, 0.1], [0.9, 0.9], [0.1, 0.9]]]),
+        "safe_set_prob": torch.tensor([[0.9, 0.9, 0.9]]),
+    }
+    return PlanStatistics(**(parts | changes))
+
+
+def test_a_plan_of_which_nothing_is_known_ranks_behind_one_that_surely_violates():
+    nan = torch.nan
+    statistics = three_plans(constraint_prob=torch.tensor([[[nan, 0.0], [1.0, 1.0], [0.0, nan]]]))
+    scores = judged(statistics)
+    assert scores.fallback.isnan().tolist() == [[True, False, True]]
+    assert not scores.feasible.any()
+    require_sound(statistics, scores)  # the one that violates can still be judged
+
+
+@pytest.mark.parametrize(
+    ("part", "named"),
+    [
+        ("constraint_prob", "constraint estimator's probabilities"),
+        ("safe_set_prob", "safe set's probabilities"),
+        ("value", "value"),
+    ],
+)
+def test_a_row_in_which_nothing_is_known_is_refused_by_the_name_of_the_network(part, named):
+    sound = three_plans()
+    require_sound(sound, judged(sound))
+    broken = three_plans(**{part: torch.full_like(getattr(sound, part), torch.nan)})
+    with pytest.raises(FloatingPointError, match=f"1 of 1 rows, the first being 0: the {named}.*training diverged"):
+        require_sound(broken, judged(broken))
+    both = PlanStatistics(*(torch.cat([a, b]) for a, b in zip(sound, broken, strict=True)))
+    with pytest.raises(FloatingPointError, match="1 of 2 rows, the first being 1"):
+        require_sound(both, judged(both))
+
+
+def test_values_of_plans_that_are_not_feasible_may_be_missing():
+    statistics = three_plans(value=torch.tensor([[[-1.0], [torch.nan], [torch.nan]]]))
+    require_sound(statistics, judged(statistics))
+    infinite = three_plans(value=torch.tensor([[[torch.inf], [-2.0], [-3.0]]]))
+    with pytest.raises(FloatingPointError, match="the value"):
+        require_sound(infinite, judged(infinite))
