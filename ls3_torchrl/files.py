@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
+from uuid import uuid4
 
 import torch
+
+#: How a file is called that is being written; one that is left was being written when the process ended.
+PARTIAL = ".partial"
+#: Free bytes below which a write that failed is taken for one that found no room.
+_NO_ROOM = 16 * 2**20
 
 
 def save_atomically(content: dict[str, Any], path: str | Path) -> Path:
@@ -107,13 +115,38 @@ def load_verified(path: str | Path, what: str) -> Any:
 
 
 def _write_atomically(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:
-    """Write beside the file, then put the new one in its place."""
+    """Write beside the file, then put the new one in its place; where that fails, the file before it stays.
+
+    Raises:
+        OSError: naming the path.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    partial = path.with_name(f".{path.name}.{uuid4().hex}{PARTIAL}")  # of this process and thread alone
+    try:
+        with partial.open("wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise OSError(error.errno, f"{error.strerror or error}; it could not be written", str(path)) from error
+    except RuntimeError as error:  # PyTorch's writer, which does not say why
+        if shutil.disk_usage(path.parent).free < _NO_ROOM:
+            raise OSError(errno.ENOSPC, "No space left on device; it could not be written", str(path)) from error
+        raise
+    finally:
+        partial.unlink(missing_ok=True)
     return path
+
+
+def sync_folder(folder: str | Path) -> None:
+    """Bring the names in a folder to the disk: a file that was renamed is then found after a power cut as well."""
+    if os.name == "nt":  # folders cannot be opened there
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

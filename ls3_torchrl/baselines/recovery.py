@@ -174,13 +174,13 @@ class SafetyCriticLoss(LatentLoss):
         """C + (1 − c) γ_risk Q'_risk(s', a'), ``[*B, 1]``."""
         keys, policy = self.tensor_keys, self.__dict__["policy"]
         constraint, after = tensordict.get(keys.constraint), tensordict.get(keys.next_observation)
+        require_shape_of(constraint, tensordict.get(keys.action)[..., :1], keys.constraint, "SafetyCriticLoss")
+        require_labels(constraint, keys.constraint)
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             rows = TensorDict({policy.in_keys[0]: after}, batch_size=constraint.shape[:-1])
             rows = policy(rows)
             require_keys(rows, [keys.policy_action], "SafetyCriticLoss, of its policy,")
             risk = self._risk(self.target_safety_critic_params, after, rows.get(keys.policy_action))[1]
-        require_shape_of(constraint, risk, keys.constraint, "SafetyCriticLoss")
-        require_labels(constraint, keys.constraint)
         violated = constraint.to(risk)
         return violated + (1.0 - violated) * self.gamma * risk
 

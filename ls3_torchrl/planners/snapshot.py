@@ -59,8 +59,8 @@ class Snapshot:
         for name, module in modules.items():
             if not torch.stack([p.detach().float().sum() for p in module.parameters()]).isfinite().all():
                 raise FloatingPointError(
-                    f"Weights of {name} are not finite, so no plan can be judged. Load weights from before its training "
-                    "diverged."
+                    f"Weights of {name} are not finite, so no plan can be judged. Load weights from before its "
+                    "training diverged."
                 )
 
     def _parameters(self) -> Iterable[nn.Parameter]:

@@ -301,7 +301,9 @@ def test_a_log_scale_that_has_left_its_range_comes_back(start):
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    assert abs(dynamics.network.biases[0][0, 0, 1].item()) < 1.0  # the log of the standard deviation of the targets, 0
+    end = dynamics.network.biases[0][0, 0, 1].item()
+    assert abs(end) < 0.5 * abs(start)  # on the way to the log of the targets' standard deviation, 0
+    assert dynamics.log_scale_bounds[0] < end < dynamics.log_scale_bounds[1]
 
 
 @pytest.mark.parametrize(("latent", "action", "named"), [((4, 3), (4, 2), "latent"), ((4, 2), (4, 3), "action")])
