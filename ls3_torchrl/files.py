@@ -7,7 +7,8 @@ import json
 import os
 import shutil
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 from uuid import uuid4
@@ -52,10 +53,36 @@ def save_json_atomically(content: dict[str, Any], path: str | Path) -> Path:
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     json.loads(save_json_atomically({"answer": 42}, f"{folder}/file.json").read_text())
+        ...     load_json(save_json_atomically({"answer": 42}, f"{folder}/file.json"), "an example")
         {'answer': 42}
     """
     return save_text_atomically(json.dumps(content, indent=2) + "\n", path)
+
+
+def load_json(path: str | Path, what: str) -> dict[str, Any]:
+    """A dictionary of a JSON file.
+
+    Args:
+        path: the file.
+        what: what it should be, for messages.
+
+    Raises:
+        FileNotFoundError: when there is none.
+        ValueError: for a file that holds none; the message names it.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}, {what}, is missing.")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError among them
+        raise ValueError(f"{path} is not {what}, or is damaged: {error}. Use another copy of it.") from error
+    if not isinstance(content, dict):
+        raise ValueError(
+            f"{path} is not {what}, or is damaged: it holds a {type(content).__name__}, not an object. "
+            "Use another copy of it."
+        )
+    return content
 
 
 def save_text_atomically(text: str, path: str | Path) -> Path:
@@ -122,23 +149,89 @@ def _write_atomically(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Pa
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{uuid4().hex}{PARTIAL}")  # of this process and thread alone
+    partial = _beside(path)  # of this process and thread alone
     try:
-        with partial.open("wb") as file:
+        with writing(partial, shown=path) as file:
             write(file)
-            file.flush()
-            os.fsync(file.fileno())
         partial.replace(path)
         sync_folder(path.parent)
-    except OSError as error:
-        raise OSError(error.errno, f"{error.strerror or error}; it could not be written", str(path)) from error
-    except RuntimeError as error:  # PyTorch's writer, which does not say why
-        if shutil.disk_usage(path.parent).free < _NO_ROOM:
-            raise OSError(errno.ENOSPC, "No space left on device; it could not be written", str(path)) from error
-        raise
     finally:
         partial.unlink(missing_ok=True)
     return path
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{uuid4().hex}{PARTIAL}")
+
+
+@contextmanager
+def writing(path: Path, *, shown: Path | None = None) -> Iterator[IO[bytes]]:
+    """A file that is open for writing, and on the disk at the end of the block.
+
+    Args:
+        path: of the file.
+        shown: how errors call it.
+
+    Raises:
+        OSError: naming the file; also where PyTorch's writer finds no room, which does not say so.
+    """
+    name = str(shown or path)
+    try:
+        with path.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise OSError(error.errno, f"{error.strerror or error}; it could not be written", name) from error
+    except RuntimeError as error:
+        if shutil.disk_usage(path.parent).free < _NO_ROOM:
+            raise OSError(errno.ENOSPC, "No space left on device; it could not be written", name) from error
+        raise
+
+
+@contextmanager
+def new_folder(path: str | Path, *, replace: bool = False) -> Iterator[Path]:
+    """A folder to be filled in the block, that takes its place when it is whole; where that fails, nothing is left.
+
+    Args:
+        path: where it will be.
+        replace: whether it takes the place of one that exists.
+
+    Raises:
+        FileExistsError: when the folder exists, unless it is to be replaced.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as there, new_folder(f"{there}/new") as folder:
+        ...     _ = save_text_atomically("whole", folder / "file.txt")
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new, old = _beside(path), _beside(path)
+    new.mkdir()
+    try:
+        yield new
+        for folder in sorted((p for p in new.rglob("*") if p.is_dir()), reverse=True):
+            sync_folder(folder)
+        sync_folder(new)
+        if replace and path.exists():
+            path.rename(old)
+        _take_place(new, path)
+        sync_folder(path.parent)
+    finally:
+        if old.exists() and not path.exists():
+            old.rename(path)
+        for left in (new, old):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _take_place(new: Path, path: Path) -> None:
+    try:
+        new.rename(path)
+    except OSError as error:
+        if path.exists():
+            raise FileExistsError(f"{path} exists already. Choose another folder, or remove it first.") from error
+        raise
 
 
 def sync_folder(folder: str | Path) -> None:

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import LazyStackedTensorDict, NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor
 from torch import Tensor
 
 from ls3_torchrl._checks import require_finite, require_keys
+from ls3_torchrl.data.arrays import Entry, read_array, require_checksum, with_checksum, write_array
 from ls3_torchrl.data.keys import EpisodeKeys, as_tuple
+from ls3_torchrl.data.memory_maps import read_memory_maps
 from ls3_torchrl.data.tags import Tag
-from ls3_torchrl.files import save_json_atomically
+from ls3_torchrl.files import load_json, new_folder, save_json_atomically
 
 FORMAT = "ls3_torchrl.episodes"
-VERSION = 2
+VERSION = 3
 _DESCRIPTION = "episodes.json"
 # Branches of a stored tensordict: entries of states lie T + 1 times for an episode, entries of steps T times.
 _STATES, _STEPS = "states", "steps"
@@ -102,7 +104,7 @@ def save_episodes(
     seed: int,
     keys: EpisodeKeys | None = None,
 ) -> Path:
-    """Write episodes by tag to memory maps, nothing twice, with a description beside them.
+    """Write episodes by tag to NumPy files, nothing twice, with a description and checksums beside them.
 
     Where an entry after a step (``("next", key)``) is the entry before the following step (``key``) throughout, as
     observations are, both are stored as one of ``T + 1`` values for an episode.
@@ -121,22 +123,28 @@ def save_episodes(
     Raises:
         FileExistsError: when the folder exists.
         TypeError: for entries that are not tensors.
+        OSError: naming the file, when it cannot be written, as on a full disk; then nothing is left.
         Further: as :func:`check_episodes`.
     """
     folder = Path(folder)
     if folder.exists():
         raise FileExistsError(f"{folder} exists already. Choose another folder, or remove it first.")
-    lengths: dict[str, list[int]] = {}
-    datasets = {Tag.parse(tag): episodes for tag, episodes in datasets.items()}
+    sets: dict[str, list[TensorDictBase]] = {}
     for tag, episodes in datasets.items():
-        check_episodes(episodes, keys=keys, name=tag.name.lower())
-        rows = _rows(episodes, tag.name.lower())
-        _require_tensors(rows, tag.name.lower())
-        lengths[tag.name.lower()] = [len(row) for row in rows]
-    for tag, episodes in datasets.items():
-        _write(_rows(episodes, tag.name.lower()), folder / tag.name.lower())
-    description = {"format": FORMAT, "version": VERSION, "task": task, "seed": seed, "episodes": lengths}
-    save_json_atomically(description, folder / _DESCRIPTION)  # last: a folder with it is whole
+        name = Tag.parse(tag).name.lower()
+        check_episodes(episodes, keys=keys, name=name)
+        sets[name] = _rows(episodes, name)
+        _require_tensors(sets[name], name)
+    with new_folder(folder) as new:
+        description = {
+            "format": FORMAT,
+            "version": VERSION,
+            "task": task,
+            "seed": seed,
+            "episodes": {name: [len(row) for row in rows] for name, rows in sets.items()},
+            "entries": {name: _write(rows, new, name) for name, rows in sets.items()},
+        }
+        save_json_atomically(with_checksum(description), new / _DESCRIPTION)
     return folder
 
 
@@ -157,22 +165,19 @@ def _require_tensors(rows: list[TensorDictBase], name: str) -> None:
             raise TypeError(f"{name}: {key} is not a tensor, and only tensors are saved. Leave it out with exclude().")
 
 
-def _write(rows: list[TensorDictBase], folder: Path) -> None:
-    """One memory map for each entry: all episodes behind one another."""
-    steps, stored = sum(map(len, rows)), TensorDict({}).memmap_(str(folder))
-    keys = _keys(rows[0])
+def _write(rows: list[TensorDictBase], folder: Path, name: str) -> list[Entry]:
+    """One file for each entry: all episodes behind one another."""
+    keys, entries = _keys(rows[0]), []
     shared = {key for key in keys if key[0] != "next" and _shared(rows, key, ("next", *key))}
     for key in keys:
-        value = rows[0].get(key)
+        values = [row.get(key) for row in rows]
         if key in shared:
-            space = stored.make_memmap((_STATES, *key), (steps + len(rows), *value.shape[1:]), dtype=value.dtype)
-            for part, row in zip(space.split([len(row) + 1 for row in rows]), rows, strict=True):
-                part[:-1].copy_(row.get(key))
-                part[-1].copy_(row.get(("next", *key))[-1])
+            last = [row.get(("next", *key))[-1:] for row in rows]
+            parts = [part for pair in zip(values, last, strict=True) for part in pair]
+            entries.append(write_array(folder, f"{name}/{_STATES}", key, parts))
         elif key[0] != "next" or key[1:] not in shared:
-            space = stored.make_memmap((_STEPS, *key), (steps, *value.shape[1:]), dtype=value.dtype)
-            for part, row in zip(space.split([len(row) for row in rows]), rows, strict=True):
-                part.copy_(row.get(key))
+            entries.append(write_array(folder, f"{name}/{_STEPS}", key, values))
+    return entries
 
 
 def _shared(rows: list[TensorDictBase], key: tuple[str, ...], twin: tuple[str, ...]) -> bool:
@@ -207,11 +212,11 @@ def load_episodes(
 
     Returns:
         Episodes ``[N, T]`` by tag, or a lazy stack of episodes ``[T_i]`` where their lengths differ. All entries are
-        views of the memory maps: writing into them writes to the files.
+        mapped from the disk; writing into them changes no file.
 
     Raises:
-        FileNotFoundError: when the folder has no description.
-        ValueError: for another format, version or domain.
+        FileNotFoundError: when the folder has no description, or a file of it is missing.
+        ValueError: for another format, version or domain, or for a damaged file: sizes and checksums are looked at.
     """
     folder = Path(folder)
     path = folder / _DESCRIPTION
@@ -219,26 +224,71 @@ def load_episodes(
         raise FileNotFoundError(
             f"{folder} holds no episodes: {_DESCRIPTION} is missing. Write some with save_episodes(), or `ls3 collect`."
         )
-    description = json.loads(path.read_text())
+    description = load_json(path, f"a description of episodes ({FORMAT})")
     kind, version = description.get("format"), description.get("version")
-    if kind != FORMAT or version not in (1, VERSION):
+    if kind != FORMAT or version not in (1, 2, VERSION):
         raise ValueError(
-            f"{folder} holds {(kind, version)}, but {FORMAT!r} of version 1 or {VERSION} is read here. Collect again."
+            f"{folder} holds {(kind, version)}, but {FORMAT!r} of version 1, 2 or {VERSION} is read here. "
+            "Collect again."
         )
-    if task is not None and description["task"] != task:
-        raise ValueError(f"{folder} holds episodes of {description['task']!r}, but {task!r} is wanted.")
+    if version == VERSION:
+        require_checksum(description, path)
+    if task is not None and description.get("task") != task:
+        raise ValueError(f"{folder} holds episodes of {description.get('task')!r}, but {task!r} is wanted.")
     datasets: dict[Tag, TensorDictBase] = {}
-    for name, lengths in description["episodes"].items():
-        stored = TensorDict.load_memmap(str(folder / name), allow_pickle=False)
-        episodes = stored if version == 1 else _read(stored, lengths)
+    for name, lengths in _lengths(description, path).items():
+        if version == VERSION:
+            flat = {_flat_key(entry, name): read_array(folder, entry) for entry in description["entries"][name]}
+        else:
+            flat = read_memory_maps(folder / name)
+        episodes = _read_first_version(flat, lengths, path) if version == 1 else _read(flat, lengths, path)
         check_episodes(episodes, keys=keys, name=name)
         datasets[Tag.parse(name)] = episodes
     return datasets
 
 
-def _read(stored: TensorDictBase, lengths: list[int]) -> TensorDictBase:
+def _flat_key(entry: Entry, name: str) -> tuple[str, ...]:
+    return (entry["branch"].removeprefix(f"{name}/"), *entry["key"])
+
+
+def _lengths(description: Mapping[str, Any], path: Path) -> dict[str, list[int]]:
+    """Steps of the episodes by tag."""
+    told, tags = description.get("episodes"), {tag.name.lower() for tag in Tag}
+    if isinstance(told, dict) and all(
+        name in tags and isinstance(lengths, list) and lengths and all(type(n) is int and n > 0 for n in lengths)
+        for name, lengths in told.items()
+    ):
+        return told
+    raise ValueError(
+        f"{path} does not say how many steps the episodes of each tag have: it is damaged. Use another copy of it."
+    )
+
+
+def _require_count(key: tuple[str, ...], values: Tensor, count: int, path: Path) -> None:
+    if values.ndim == 0 or len(values) != count:
+        raise ValueError(
+            f"{path} promises {count} values of {'.'.join(key)}, where {list(values.shape)} are stored: it is damaged. "
+            "Use another copy of the folder."
+        )
+
+
+def _read_first_version(flat: dict[tuple[str, ...], Tensor], batch: list[int], path: Path) -> TensorDictBase:
+    """Of the first version, which kept everything as ``[N, T, ...]``."""
+    out = TensorDict({}, batch)
+    for key, values in flat.items():
+        if list(values.shape[:2]) != list(out.batch_size):
+            raise ValueError(
+                f"{path} promises {list(out.batch_size)} steps, where {'.'.join(key)} has {list(values.shape)}: it is "
+                "damaged. Use another copy of the folder."
+            )
+        out.set(key, values)
+    return out
+
+
+def _read(flat: dict[tuple[str, ...], Tensor], lengths: list[int], path: Path) -> TensorDictBase:
     """Views of what :func:`_write` has written."""
-    flat = {key: stored.get(key) for key in _keys(stored)}
+    for key, values in flat.items():
+        _require_count(key, values, sum(lengths) + (len(lengths) if key[0] == _STATES else 0), path)
     if len(set(lengths)) == 1:
         return _view(flat, len(lengths), lengths[0], 0, 0)
     rows, start = [], 0

@@ -2,6 +2,7 @@ import json
 import pickle
 import shutil
 
+import numpy as np
 import pytest
 import torch
 from tensordict import LazyStackedTensorDict, NonTensorData, TensorDict
@@ -34,7 +35,7 @@ def test_round_trip_is_exact(tmp_path):
         assert read[tag]["pixels"].dtype == torch.uint8
     description = json.loads((folder / "episodes.json").read_text())
     assert description["seed"] == 5
-    assert description["version"] == 2
+    assert description["version"] == 3
     assert description["episodes"] == {"success": [3, 3], "constraint": [4]}
 
 
@@ -132,7 +133,9 @@ def assert_same_bits(one, other):
 
 
 def size(folder):
-    return sum(file.stat().st_size for file in folder.rglob("*.memmap"))
+    """Bytes of the values themselves."""
+    arrays = sum(np.load(file, mmap_mode="r").nbytes for file in folder.rglob("*.npy"))
+    return arrays + sum(file.stat().st_size for file in folder.rglob("*.memmap"))
 
 
 def test_what_follows_itself_is_stored_once_and_comes_back_bit_by_bit(tmp_path):
@@ -144,7 +147,7 @@ def test_what_follows_itself_is_stored_once_and_comes_back_bit_by_bit(tmp_path):
     read = load_episodes(folder)[Tag.RAND]
     assert read.batch_size == (3, 4)
     assert_same_bits(read, written)
-    # One memory map behind both names.
+    # One array behind both names.
     for key in ("pixels", ("agent", "state"), "done"):
         twin = ("next", *((key,) if isinstance(key, str) else key))
         assert read[key].untyped_storage().data_ptr() == read[twin].untyped_storage().data_ptr()
@@ -171,8 +174,8 @@ def test_what_does_not_follow_itself_is_stored_as_it_is(tmp_path, odd):
     folder = save_episodes({Tag.RAND: written}, tmp_path / "demos", task="mine", seed=0)
     assert_same_bits(load_episodes(folder)[Tag.RAND], written)
     once = odd == "nan"  # which is bit by bit what follows it
-    assert (folder / "rand" / "states" / "agent" / "state.memmap").exists() == once
-    assert (folder / "rand" / "steps" / "next" / "agent" / "state.memmap").exists() != once
+    assert (folder / "rand" / "states" / "agent-state.npy").exists() == once
+    assert (folder / "rand" / "steps" / "next-agent-state.npy").exists() != once
 
 
 @pytest.mark.parametrize("how", ["list", "lazy stack"])
@@ -186,9 +189,10 @@ def test_episodes_of_different_lengths_come_back_as_they_were(tmp_path, how):
     for row, there in zip(read.unbind(0), rows, strict=True):
         assert_same_bits(row, there)
     assert size(folder / "rand" / "states") == (11 + 4) * (3 * 64 * 64 + 5 * 4 + 1)
-    # Writing into a view writes to the file.
+    # Writing into a view writes to no file.
     read[1]["pixels"][2] = 7
-    assert (load_episodes(folder)[Tag.RAND][1]["next", "pixels"][1] == 7).all()
+    assert (read[1]["next", "pixels"][1] == 7).all()
+    assert_same_bits(load_episodes(folder)[Tag.RAND][1], rows[1])
 
 
 def test_a_list_of_episodes_of_one_length_is_read_as_a_batch(tmp_path):
@@ -211,6 +215,37 @@ def test_version_1_is_still_read(tmp_path):
     assert size(folder) < 0.7 * size(tmp_path / "rand")
 
 
+def as_before(folder, data, version):
+    """Episodes ``[N, T]`` as versions 1 and 2 kept them, in memory maps of tensordict."""
+    episodes = list(data.batch_size)
+    if version == 2:
+        states = torch.cat([data["pixels"], data["next", "pixels"][:, -1:]], 1).flatten(0, 1)
+        steps = data.exclude("pixels", ("next", "pixels")).flatten(0, 1).to_dict()
+        episodes = [data.shape[1]] * data.shape[0]
+        data = TensorDict({"states": {"pixels": states}, "steps": steps}, [])
+    data.contiguous().memmap(str(folder / "rand"))
+    content = {"format": "ls3_torchrl.episodes", "version": version, "task": "x", "seed": 0}
+    (folder / "episodes.json").write_text(json.dumps(content | {"episodes": {"rand": episodes}}))
+    return folder
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_files_of_earlier_versions_are_read_and_not_touched(tmp_path, version):
+    torch.manual_seed(0)
+    data = followed(2, 3)
+    folder = as_before(tmp_path / "demos", data, version)
+    before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    read = load_episodes(folder, task="x")[Tag.RAND]
+    assert_same_bits(read, data)
+    read["pixels"].zero_()
+    assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == before
+    short = next(folder.rglob("pixels.memmap"))
+    short.write_bytes(before[short][:-5])
+    with pytest.raises(ValueError, match=r"pixels\.memmap has \d+ bytes where \d+ were written"):
+        load_episodes(folder)
+    assert short.read_bytes() == before[short][:-5]  # and it has not grown
+
+
 class Bomb:
     def __reduce__(self):
         return (exec, ("raise SystemExit('a pickle was run')",))
@@ -219,19 +254,14 @@ class Bomb:
 @pytest.mark.parametrize("version", [1, 2])
 def test_no_pickle_of_a_folder_is_run(tmp_path, version):
     data = followed(1, 2)
-    folder = save_episodes({Tag.RAND: data}, tmp_path / "demos", task="x", seed=0)
-    if version == 1:
-        shutil.rmtree(folder / "rand")
-        data.contiguous().memmap(str(folder / "rand"))
-        content = json.loads((folder / "episodes.json").read_text()) | {"version": 1, "episodes": {"rand": [1, 2]}}
-        (folder / "episodes.json").write_text(json.dumps(content))
+    folder = as_before(tmp_path / "demos", data, version)
     # Someone puts an entry into the folder whose value is a pickle.
     TensorDict({"extra": NonTensorData("x")}).memmap(str(tmp_path / "odd"))
     shutil.copytree(tmp_path / "odd" / "extra", folder / "rand" / "extra")
     (folder / "rand" / "extra" / "other.pickle").write_bytes(pickle.dumps({"data": Bomb()}))
     meta, odd = (json.loads((path / "meta.json").read_text()) for path in (folder / "rand", tmp_path / "odd"))
     (folder / "rand" / "meta.json").write_text(json.dumps(meta | {"extra": odd["extra"]}))
-    with pytest.raises(RuntimeError, match="Refusing to load pickled"):
+    with pytest.raises(ValueError, match=r"damaged|no tensor"):
         load_episodes(folder)
 
 
