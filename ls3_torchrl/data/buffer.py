@@ -14,7 +14,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer
 
-from ls3_torchrl._checks import require_at_least, require_finite, require_keys
+from ls3_torchrl._checks import require_at_least
+from ls3_torchrl.data.conform import conform
 from ls3_torchrl.data.encoding import encode_frames
 from ls3_torchrl.data.episode_store import EpisodeStore
 from ls3_torchrl.data.episodes import Episodes, done_steps, split_episodes
@@ -179,31 +180,54 @@ class TaggedReplayBuffer:
         return self._add(tagged)
 
     def _add(self, tagged: list[tuple[TensorDictBase, Tag]]) -> Tensor:
-        for episode, _ in tagged:
-            require_keys(episode, (*self.keys.required, *self.extra_keys), "TaggedReplayBuffer.add")
-        indices = [self._add_one(episode, tag) for episode, tag in tagged]
+        """Check all, then encode all, then write all: where one is refused, none is stored."""
+        keys = self.keys
+        episodes = conform([episode for episode, _ in tagged], keys, self.extra_keys, who="TaggedReplayBuffer.add")
+        if self.success_tail is not None:
+            tail = self.success_tail
+            episodes = [e[: length_without_idle_end(e.get(keys.success), tail)] for e in episodes]
+        for episode in episodes:
+            self._store.require_room(len(episode))
+        if episodes:
+            self._require_as_stored(episodes[0])
+        written = [
+            self._rows_of(episode, tag) for episode, (_, tag) in zip(episodes, tagged, strict=True)
+        ]  # before anything is written: the encoder may fail
+        indices = [self._store.write(frames, rows) for frames, rows in written]
         for view in self._views.values():
             view.sampler.refresh()
         return torch.cat(indices) if indices else torch.zeros(0, dtype=torch.long)
 
-    def _add_one(self, episode: TensorDictBase, tag: Tag) -> Tensor:
+    def _rows_of(self, episode: TensorDictBase, tag: Tag) -> tuple[TensorDict, TensorDict]:
+        """Observations ``[T + 1]`` and transitions ``[T]`` of an episode."""
         keys = self.keys
-        if self.success_tail is not None:
-            episode = episode[: length_without_idle_end(episode.get(keys.success), self.success_tail)]
-        self._store.require_room(len(episode))
-        require_finite(episode.get(keys.action), "The episode's action")
-        require_finite(episode.get(keys.reward), "The episode's reward")
         frames = torch.cat([episode.get(keys.observation), episode.get(keys.next_observation)[-1:]])
         rows = episode_rows(
             episode,
-            self._posteriors_of_new(frames),  # before anything is written: the encoder may fail
+            self._posteriors_of_new(frames),
             tag,
             keys=keys,
             extra_keys=self.extra_keys,
             gamma=self.gamma,
             continue_failures=self.continue_failures,
         )
-        return self._store.write(TensorDict({}, [len(frames)]).set(keys.observation, frames), rows)
+        return TensorDict({}, [len(frames)]).set(keys.observation, frames), rows
+
+    def _require_as_stored(self, episode: TensorDictBase) -> None:
+        """Refuse entries of another shape or dtype than those that are stored."""
+        if not len(self):
+            return
+        stored = [
+            (self.frames, self.keys.observation),
+            *((self.transitions, k) for k in (self.keys.action, *self.extra_keys)),
+        ]
+        for store, key in stored:
+            there, new = store.storage[0].get(key), episode.get(key)
+            if there.shape != new.shape[1:] or there.dtype != new.dtype:
+                raise ValueError(
+                    f"TaggedReplayBuffer.add: {key!r} has {new.dtype} {list(new.shape[1:])} for each step, where the "
+                    f"buffer holds {there.dtype} {list(there.shape)}. Make another buffer for other episodes."
+                )
 
     def _posteriors_of_new(self, frames: Tensor) -> TensorDict:
         if self._encoder is not None:

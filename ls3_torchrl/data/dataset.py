@@ -10,8 +10,10 @@ import torch
 from tensordict import LazyStackedTensorDict, NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor
 from torch import Tensor
 
-from ls3_torchrl._checks import require_finite, require_keys
+from ls3_torchrl._checks import require_keys
 from ls3_torchrl.data.arrays import Entry, read_array, require_checksum, with_checksum, write_array
+from ls3_torchrl.data.conform import conform
+from ls3_torchrl.data.episodes import split_episodes
 from ls3_torchrl.data.keys import EpisodeKeys, as_tuple
 from ls3_torchrl.data.memory_maps import read_memory_maps
 from ls3_torchrl.data.tags import Tag
@@ -39,8 +41,12 @@ def check_episodes(
     Raises:
         KeyError: when a key is missing.
         ValueError: for a wrong batch shape, wrong image shape, observations that differ in shape or type from those
-            after them, or data that are not finite.
+            after them, data that are not finite, or rows that hold padding or more than one episode.
         TypeError: when the images are not uint8.
+        Further: as the buffer refuses an episode.
+
+    Warns:
+        DataWarning: naming what the buffer would convert.
 
     Example:
         >>> from ls3_torchrl.data import episode_from_arrays
@@ -49,30 +55,31 @@ def check_episodes(
         >>> episode = episode_from_arrays(torch.zeros(10, 4), torch.zeros(9, 2), -torch.ones(9), no, no, keys=keys)
         >>> check_episodes([episode], keys=keys)
     """
-    keys = keys or EpisodeKeys()
+    _checked(episodes, keys or EpisodeKeys(), name)
+
+
+def _checked(episodes: TensorDictBase | list[TensorDictBase], keys: EpisodeKeys, name: str) -> list[TensorDictBase]:
+    """Episodes ``[T_i]`` in the form that is kept."""
     rows = _rows(episodes, name)
-    # Whole sets are checked at once where they can be: a pass over each episode of its own takes longer.
-    whole = [episodes] if isinstance(episodes, TensorDictBase) and _length(rows) is not None else rows
-    for part in whole:
-        require_keys(part, keys.required, name)
-        _check_observations(part, keys, name)
-        require_finite(part.get(keys.action), f"{name}: action")
-        require_finite(part.get(keys.reward), f"{name}: reward")
-
-
-def _check_observations(episodes: TensorDictBase, keys: EpisodeKeys, name: str) -> None:
-    before, after = (episodes.get(key) for key in (keys.observation, keys.next_observation))
-    for key, value in ((keys.observation, before), (keys.next_observation, after)):
+    for number, row in enumerate(rows):
+        parts = split_episodes(row)
+        if len(parts) != 1 or len(parts[0]) != len(row):
+            raise ValueError(
+                f"{name}: row {number} of {len(row)} steps holds {len(parts)} episodes of "
+                f"{[len(part) for part in parts]} steps. Give split_episodes(data), one episode for each row."
+            )
+        require_keys(row, keys.required, name)
         if keys.observation == "pixels":
-            if value.dtype != torch.uint8:
-                raise TypeError(f"{name}: {key} must be uint8 in 0..255, got {value.dtype}.")
-            if value.ndim != episodes.ndim + 3 or value.shape[-2:] != (64, 64):
-                raise ValueError(f"{name}: {key} must have shape [N, T, C, 64, 64], got {list(value.shape)}.")
-        require_finite(value, f"{name}: {key}")
-    if before.shape != after.shape or before.dtype != after.dtype:
+            for key in (keys.observation, keys.next_observation):
+                _check_images(row.get(key), key, name)
+    return conform(rows, keys, who=name)
+
+
+def _check_images(value: Tensor, key: NestedKey, name: str) -> None:
+    if value.ndim != 4 or value.shape[-2:] != (64, 64):
         raise ValueError(
-            f"{name}: {keys.observation!r} and {keys.next_observation} must be alike, got {before.dtype} "
-            f"{list(before.shape)} and {after.dtype} {list(after.shape)}. Give both in one shape and type."
+            f"{name}: {key} must have shape [N, T, C, 64, 64], got [N, {', '.join(map(str, value.shape))}]. Resize the "
+            "images and put their channels first; observations of an encoder of your own go under another key."
         )
 
 
@@ -132,9 +139,8 @@ def save_episodes(
     sets: dict[str, list[TensorDictBase]] = {}
     for tag, episodes in datasets.items():
         name = Tag.parse(tag).name.lower()
-        check_episodes(episodes, keys=keys, name=name)
-        sets[name] = _rows(episodes, name)
-        _require_tensors(sets[name], name)
+        sets[name] = rows = _checked(episodes, keys or EpisodeKeys(), name)
+        _require_tensors(rows, name)
     with new_folder(folder) as new:
         description = {
             "format": FORMAT,

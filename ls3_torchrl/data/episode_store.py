@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from ls3_torchrl._checks import require_at_least
-from ls3_torchrl.data.stores import RowStore
-from ls3_torchrl.files import save_json_atomically
+from ls3_torchrl.data.arrays import require_checksum, with_checksum
+from ls3_torchrl.data.stores import RowStore, require_own
+from ls3_torchrl.files import load_json, new_folder, save_json_atomically
 
 _DESCRIPTION = "buffer.json"
+VERSION = 2
 
 
 class EpisodeStore:
@@ -122,7 +123,7 @@ class EpisodeStore:
         self._set_counters(state_dict["counters"])
 
     def dumps(self, path: str | Path, description: dict[str, Any]) -> None:
-        """Write both rings, the counters and a description below the folder ``path``, over earlier ones.
+        """Write both rings, the counters and a description to the folder ``path``; what was there stays until then.
 
         Raises:
             ValueError: for the ``scratch_dir``.
@@ -131,11 +132,14 @@ class EpisodeStore:
         path = Path(path)
         if self.scratch_dir is not None and path.resolve() == self.scratch_dir.resolve():
             raise ValueError(f"{path} is the buffer's scratch_dir. Choose another folder to save to.")
-        (path / _DESCRIPTION).unlink(missing_ok=True)
-        self.frames.dumps(path / "frames")
-        self.transitions.dumps(path / "transitions")
-        # Last: a folder with it is whole.
-        save_json_atomically({**description, "counters": self._counters()}, path / _DESCRIPTION)
+        require_own(path, _is_dump)
+        with new_folder(path, replace=True) as new:
+            self.frames.dumps(new / "frames")
+            self.transitions.dumps(new / "transitions")
+            # Last: a folder with it is whole.
+            save_json_atomically(
+                with_checksum({**description, "counters": self._counters(), "version": VERSION}), new / _DESCRIPTION
+            )
 
     @staticmethod
     def description(path: str | Path) -> dict[str, Any]:
@@ -143,17 +147,24 @@ class EpisodeStore:
 
         Raises:
             FileNotFoundError: when the folder holds no whole store.
+            ValueError: when it is damaged.
         """
         file = Path(path) / _DESCRIPTION
         if not file.is_file():
             raise FileNotFoundError(f"{path} holds no saved buffer: {_DESCRIPTION} is missing. Save one with dumps().")
-        return json.loads(file.read_text())
+        found = load_json(file, "a description of a saved buffer")
+        if found.get("version", 1) == VERSION:
+            require_checksum(found, file)
+        if not isinstance(found.get("counters"), dict) or {"frames_written", "shift"} - set(found["counters"]):
+            raise ValueError(f"{file} is not a description of a saved buffer, or is damaged. Use another copy of it.")
+        return found
 
     def loads(self, path: str | Path) -> None:
-        """Take over both rings and the counters."""
-        counters = self.description(path)["counters"]
-        self.frames.loads(Path(path) / "frames")
-        self.transitions.loads(Path(path) / "transitions")
+        """Take over both rings and the counters; where that fails, the store stays as it was."""
+        counters, path = self.description(path)["counters"], Path(path)
+        frames, transitions = self.frames.read(path / "frames"), self.transitions.read(path / "transitions")
+        self.frames.restore(frames)
+        self.transitions.restore(transitions)
         self._set_counters(counters)
 
     def _counters(self) -> dict[str, int]:
@@ -161,3 +172,8 @@ class EpisodeStore:
 
     def _set_counters(self, counters: Mapping[str, int]) -> None:
         self._frames_written, self._shift = counters["frames_written"], counters["shift"]
+
+
+def _is_dump(folder: Path) -> bool:
+    """Whether ``dumps`` wrote this, or what an earlier version wrote was cut off."""
+    return (folder / _DESCRIPTION).is_file() or {p.name for p in folder.iterdir()} <= {"frames", "transitions"}

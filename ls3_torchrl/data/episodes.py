@@ -115,8 +115,8 @@ def split_episodes(data: Episodes) -> list[TensorDictBase]:
     """Single episodes ``[T]`` from the ways in which whole episodes arrive.
 
     A step that is done (``("next", "done")``, ``"terminated"`` or ``"truncated"``), or behind which the collector's
-    trajectory changes, ends an episode: what follows it is the next one. Padding that a collector's mask names is
-    left out.
+    trajectory changes or ``is_init`` is true, ends an episode: what follows it is the next one. Padding that a
+    collector's mask names is left out.
 
     Args:
         data: an episode ``[T]``; several behind one another ``[T_1 + T_2 + ...]``, as a
@@ -158,6 +158,9 @@ def _without_padding(row: TensorDictBase) -> TensorDictBase:
 def _split_row(row: TensorDictBase) -> list[TensorDictBase]:
     ends = done_steps(row)
     last = torch.zeros(len(row), dtype=torch.bool) if ends is None else ends.clone()
+    begins = row.get("is_init", None)
+    if isinstance(begins, Tensor) and begins.dtype == torch.bool and begins.numel() == len(row):
+        last[:-1] |= begins.flatten()[1:].cpu()
     trajectory = row.get(_TRAJECTORY, None)
     if trajectory is not None:
         number = trajectory.flatten().cpu()

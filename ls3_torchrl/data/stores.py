@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,10 +14,28 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayB
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.storages import Storage
 
+from ls3_torchrl.data.arrays import read_array, require_checksum, with_checksum, write_array
+from ls3_torchrl.data.keys import as_tuple
+from ls3_torchrl.data.memory_maps import read_memory_maps
+from ls3_torchrl.files import load_json, new_folder, save_json_atomically
+
 #: Rows that are copied at a time where all of them might not fit into memory.
 _CHUNK = 1024
+_META = "meta.json"
 #: Marks a folder that a store made for its own use.
 _SCRATCH = "scratch.txt"
+
+
+class Dump(NamedTuple):
+    """What was saved of a store.
+
+    Attributes:
+        rows: ``[n]``; ``None`` without any.
+        counters: of the ring.
+    """
+
+    rows: TensorDictBase | None
+    counters: dict[str, Any]
 
 
 class RowStore(TensorDictReplayBuffer):
@@ -74,7 +91,9 @@ class RowStore(TensorDictReplayBuffer):
         if self._folder is not None and not self.storage.initialized:
             _clear(self._folder, _is_scratch)
             self._folder.mkdir(parents=True, exist_ok=True)
-            (self._folder / _SCRATCH).write_text("A replay buffer's memory while it is in use; it can be removed.\n")
+            (self._folder / _SCRATCH).write_text(
+                "A replay buffer's memory while it is in use; it can be removed.\n", encoding="utf-8"
+            )
         # Else a store that is first written under inference_mode() could never be written outside of it.
         with torch.inference_mode(False), torch.no_grad():
             return super().extend(rows.detach(), update_priority=update_priority)
@@ -100,23 +119,52 @@ class RowStore(TensorDictReplayBuffer):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take over the rows and counters of another store."""
         count = state_dict["count"]
-        self._restore(TensorDict(state_dict["rows"], [count]) if count else None, state_dict)
+        self.restore(Dump(TensorDict(state_dict["rows"], [count]) if count else None, state_dict))
 
     def dumps(self, path: str | Path) -> None:
-        """Write the rows and counters below the folder ``path``."""
+        """Write the rows and counters to the folder ``path``; an earlier dump there stays until this one is whole.
+
+        Raises:
+            FileExistsError: for a folder with other files.
+            OSError: naming the file, when it cannot be written, as on a full disk.
+        """
         path = Path(path)
-        _clear(path, _is_dump)
-        path.mkdir(parents=True, exist_ok=True)
-        if len(self):
-            self.storage[:].memmap(str(path / "rows"), copy_existing=True)
-        (path / "meta.json").write_text(json.dumps(self._counters()))
+        require_own(path, _is_dump)
+        with new_folder(path, replace=True) as new:
+            rows = self.storage[:] if len(self) else TensorDict({}, [0])
+            entries = [write_array(new, "rows", as_tuple(key), [value]) for key, value in rows.items(True, True)]
+            save_json_atomically(with_checksum({**self._counters(), "entries": entries}), new / _META)
 
     def loads(self, path: str | Path) -> None:
-        """Take over rows and counters from the folder ``path``; no pickles are read."""
+        """Take over rows and counters from the folder ``path``; no pickles are read.
+
+        Raises:
+            FileNotFoundError: for a folder without a dump, or when a file of it is missing.
+            ValueError: naming the file, when it is damaged; the store stays as it was.
+        """
+        self.restore(self.read(path))
+
+    @staticmethod
+    def read(path: str | Path) -> Dump:
+        """What :meth:`dumps` has written, after its checksums; mapped from the disk."""
         path = Path(path)
-        counters = json.loads((path / "meta.json").read_text())
-        rows = TensorDict.load_memmap(str(path / "rows"), allow_pickle=False) if counters["count"] else None
-        self._restore(rows, counters)
+        counters = load_json(path / _META, "a description of saved rows")
+        rows = None
+        if "entries" in counters:
+            require_checksum(counters, path / _META)
+            if counters["count"]:
+                found = {tuple(entry["key"]): read_array(path, entry) for entry in counters["entries"]}
+                rows = TensorDict(found, [counters["count"]])
+        elif _is_dump(path):  # as it was written before, in memory maps
+            if counters["count"]:
+                found = read_memory_maps(path / "rows")
+                _require_rows(found, counters["count"], path)
+                rows = TensorDict(found, [counters["count"]])
+        else:
+            raise ValueError(
+                f"{path / _META} is not a description of saved rows, or is damaged. Use another copy of it."
+            )
+        return Dump(rows, counters)
 
     def _counters(self) -> dict[str, int]:
         return {
@@ -126,7 +174,9 @@ class RowStore(TensorDictReplayBuffer):
             "write_count": self.write_count,
         }
 
-    def _restore(self, rows: TensorDictBase | None, counters: dict[str, int]) -> None:
+    def restore(self, dump: Dump) -> None:
+        """Take over rows and counters."""
+        rows, counters = dump
         self.empty()
         if counters["capacity"] != self.capacity:
             self.set_storage(self._make_storage(counters["capacity"]))
@@ -137,15 +187,28 @@ class RowStore(TensorDictReplayBuffer):
         self.writer.load_state_dict({"_cursor": counters["cursor"], "_write_count": counters["write_count"]})
 
 
-def _clear(folder: Path, is_ours: Callable[[Path], bool]) -> None:
-    """Remove what an earlier store has left; refuse to remove anything else."""
-    if not folder.exists() or not any(folder.iterdir()):
-        return
-    if not is_ours(folder):
+def _require_rows(found: dict[tuple[str, ...], Tensor], count: int, path: Path) -> None:
+    for key, value in found.items():
+        if value.ndim == 0 or len(value) != count:
+            raise ValueError(
+                f"{path / _META} promises {count} rows, where {'.'.join(key)} has {list(value.shape)}: it is damaged. "
+                "Use another copy of the folder."
+            )
+
+
+def require_own(folder: Path, is_ours: Callable[[Path], bool]) -> None:
+    """Raise ``FileExistsError`` for a folder with files that are not a store's to remove."""
+    if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not is_ours(folder))):
         raise FileExistsError(
             f"{folder} holds files that are not a replay buffer's to remove. Choose another folder, or empty it first."
         )
-    shutil.rmtree(folder)
+
+
+def _clear(folder: Path, is_ours: Callable[[Path], bool]) -> None:
+    """Remove what an earlier store has left; refuse to remove anything else."""
+    require_own(folder, is_ours)
+    if folder.exists():
+        shutil.rmtree(folder)
 
 
 def _is_scratch(folder: Path) -> bool:
@@ -156,6 +219,6 @@ def _is_scratch(folder: Path) -> bool:
 def _is_dump(folder: Path) -> bool:
     """Whether ``dumps`` wrote this."""
     try:
-        return {"cursor", "write_count"} <= set(json.loads((folder / "meta.json").read_text()))
-    except (OSError, ValueError, TypeError):
+        return {"cursor", "write_count", "count", "capacity"} <= set(load_json(folder / _META, ""))
+    except (OSError, ValueError):
         return False

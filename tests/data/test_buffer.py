@@ -204,7 +204,7 @@ def test_a_batch_of_episodes_is_stored_one_after_another():
     buffer.add(torch.stack([camera.shoot(3), camera.shoot(3, success=[2])]), "success")
     buffer.encode(reading_encoder())
     assert_rows_show_their_frames(buffer, [0, 1, 2, 4, 5, 6])
-    # Labels stop at the episode's end: the second episode's success is not the first one's.
+    # Labels stop at the end: the second episode's success is not the first one's.
     assert buffer.transitions.storage[:]["in_success"].flatten().tolist() == [False] * 3 + [True] * 3
 
 
@@ -367,7 +367,7 @@ def test_numbers_that_are_not_finite_never_get_in(key, what, bad):
     episode = Camera().shoot(3)
     episode[key][1, 0] = bad
     buffer = TaggedReplayBuffer(20, latent_dim=D)
-    with pytest.raises(ValueError, match=f"episode's {what} is not finite: 1 of"):
+    with pytest.raises(ValueError, match=f"{what}.* is not finite: 1 of"):
         buffer.add(episode, "success")
     assert len(buffer) == len(buffer.frames) == 0
 

@@ -6,9 +6,10 @@ import pickle
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
+from torchrl.data import Bounded
 
 from ls3_torchrl import LS3Agent
-from ls3_torchrl.data import EpisodeKeys, Tag, TaggedReplayBuffer
+from ls3_torchrl.data import DataWarning, EpisodeKeys, Tag, TaggedReplayBuffer
 from ls3_torchrl.trainers import LossOptions, LS3Options, LS3Trainer, OfflineOptions, OnlineOptions, OptimOptions
 from ls3_torchrl.trainers.ls3 import LEARNERS
 
@@ -25,8 +26,9 @@ def filled(episode):
 
     def make(agent, **options):
         buffer = TaggedReplayBuffer(100, latent_dim=8, **options)
-        for tag in ("success", "constraint", "online"):
-            buffer.add(episode(actions=torch.randn(9, 2)), tag)
+        flags = {"success": {"success": 8}, "constraint": {"constraint": 5}, "online": {}}
+        for tag, rises in flags.items():
+            buffer.add(episode(actions=torch.randn(9, 2), **rises), tag)
         buffer.encode(agent.encoder)
         return buffer
 
@@ -293,3 +295,28 @@ def test_a_copy_of_a_trainer_draws_from_a_buffer_of_its_own(make_agent, filled):
 def test_latents_of_another_size_than_the_buffers_are_refused_before_any_work(make_agent, filled):
     with pytest.raises(ValueError, match=r"agent's latents have size 5, the buffer's 8"):
         trainer_of(make_agent(latent_dim=5), filled(make_agent()))
+
+
+def test_data_of_another_robot_are_refused_before_any_step(make_agent, episode):
+    agent = make_agent(action_spec=Bounded(-1.0, 1.0, shape=(2,)))
+
+    def train(actions):
+        buffer = TaggedReplayBuffer(100, latent_dim=8)
+        buffer.add(episode(actions=actions, success=8, constraint=4), "success")
+        buffer.encode(agent.encoder)
+        trainer_of(agent, buffer).train_offline()
+
+    with pytest.raises(ValueError, match=r"'action' has 3 actions, the agent's networks have 2"):
+        train(torch.zeros(9, 3))
+    with pytest.raises(ValueError, match=r"'action' lies outside of what can be carried out in 9 of 9 steps.*unit"):
+        train(torch.full((9, 2), 10.0))
+
+
+@pytest.mark.parametrize(("flags", "missing"), [({"constraint": 4}, "success"), ({"success": 8}, "violation")])
+def test_data_without_a_success_or_a_violation_are_warned_of(make_agent, episode, flags, missing):
+    agent, buffer = make_agent(), TaggedReplayBuffer(100, latent_dim=8)
+    buffer.add(episode(**flags), "success")
+    buffer.encode(agent.encoder)
+    trainer = trainer_of(agent, buffer, offline=OfflineOptions(0, 0, 0, 0))
+    with pytest.warns(DataWarning, match=f"hold no {missing}"):
+        trainer.train_offline()
