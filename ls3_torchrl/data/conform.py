@@ -63,15 +63,11 @@ def _conform(
             raise TypeError(f"{who}: {key!r} must be a tensor, got {type(value).__name__}. Give numbers.")
         out.set(key, value.detach())
     for key in (keys.reward, keys.constraint, keys.success):
-        out.set(key, _column(out.get(key), key, steps, who, said))
+        _require_column(out.get(key), key, steps, who)
     action = out.get(keys.action)
-    if action.ndim == 1:
-        said[f"{keys.action!r} from [T] to [T, 1]"] = None
-        action = action.unsqueeze(-1)
     if action.ndim != 2:
         raise ValueError(
-            f"{who}: {keys.action!r} must have shape [T, A], got {list(action.shape)}. Flatten each action to one "
-            "dimension."
+            f"{who}: {keys.action!r} must have shape [T, A], got {list(action.shape)}. Give each action one dimension."
         )
     out.set(keys.action, as_float32(action, keys.action, said))
     out.set(keys.reward, as_float32(out.get(keys.reward), keys.reward, said))
@@ -90,17 +86,12 @@ def _shown(key: NestedKey) -> str:
     return key if isinstance(key, str) else repr(key)
 
 
-def _column(value: Tensor, key: NestedKey, steps: int, who: str, said: dict[str, None]) -> Tensor:
-    """Values of steps as ``[T, 1]``."""
-    if value.shape == (steps,):
-        said[f"{key!r} from [T] to [T, 1]"] = None
-        return value.unsqueeze(-1)
+def _require_column(value: Tensor, key: NestedKey, steps: int, who: str) -> None:
     if value.shape != (steps, 1):
         raise ValueError(
             f"{who}: {key!r} must have shape [T, 1] with T = {steps} steps, got {list(value.shape)}. Give one value "
-            "for each step."
+            "for each step, with unsqueeze(-1) where they are [T]; episode_from_arrays() takes either."
         )
-    return value
 
 
 def as_float32(value: Tensor, key: NestedKey, said: dict[str, None]) -> Tensor:
@@ -135,18 +126,15 @@ def _observation(value: Tensor, key: NestedKey, who: str, said: dict[str, None])
         return value
     require_finite(value, f"{who}: {_shown(key)}")
     low, high = (float(end) for end in value.aminmax())
-    whole = not value.is_floating_point() or bool((value == value.round()).all())
-    if whole and low >= 0 and high <= 255 and (high > 1 or high == 0 or not value.is_floating_point()):
-        said[f"{key!r} from {value.dtype} in 0..255 to torch.uint8"] = None
-        return value.to(torch.uint8)
-    scaled = value * 255.0
-    if not whole and low >= 0 and high <= 1 and bool(((scaled - scaled.round()).abs() < 1e-2).all()):
-        said[f"{key!r} from {value.dtype} in [0, 1] to torch.uint8 in 0..255"] = None
-        return scaled.round().to(torch.uint8)
+    if value.is_floating_point() and low >= 0 and high <= 1:  # as the encoder reads them, too
+        scaled = value * 255.0
+        if bool(((scaled - scaled.round()).abs() < 1e-2).all()):
+            said[f"{key!r} from {value.dtype} in [0, 1] to torch.uint8 in 0..255"] = None
+            return scaled.round().to(torch.uint8)
     raise TypeError(
         f"{who}: {key!r} must be uint8 images in 0..255, got {value.dtype} from {low:.4g} to {high:.4g}. Give "
-        "(255 * images).round().byte() for images in [0, 1], or choose another key for observations of an encoder of "
-        "your own."
+        "images.byte() where they lie in 0..255, (255 * images).round().byte() where they lie in [0, 1]; observations "
+        "of an encoder of your own go under another key."
     )
 
 
