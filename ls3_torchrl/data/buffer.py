@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -14,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer
 
-from ls3_torchrl._checks import require_at_least
+from ls3_torchrl._checks import DataWarning, require_at_least
 from ls3_torchrl.data.conform import conform
 from ls3_torchrl.data.encoding import encode_frames
 from ls3_torchrl.data.episode_store import EpisodeStore
@@ -59,11 +60,15 @@ class TaggedReplayBuffer:
         device: where sampled batches live.
 
     Raises:
-        ValueError: for a capacity below 1, a key that the buffer needs for itself, or (in :meth:`add`) data that are
-            not finite.
+        ValueError: for a capacity below 1, or a key that the buffer needs for itself; in :meth:`add`, for episodes that
+            cannot be understood: of several, none is stored then.
+        TypeError: in :meth:`add`, for images of another dtype than uint8, or entries that are no tensors.
         KeyError: in :meth:`add`, for a missing key.
         RuntimeError: in :meth:`sample`, without encoder or without rows of the selection; in :meth:`encode` and
             :meth:`sample_frame_transitions`, when frames were overwritten.
+
+    Warns:
+        DataWarning: in :meth:`add`, of what was converted, and once when offline data begin to be overwritten.
 
     Example:
         >>> from ls3_torchrl.modules import PixelEncoder
@@ -112,6 +117,7 @@ class TaggedReplayBuffer:
         self._views: dict[RowSelection, TensorDictReplayBuffer] = {}
         self._encoder: TensorDictModuleBase | None = None
         self._encoded = False
+        self._warned = False  # of offline data that are overwritten
 
     def __len__(self) -> int:
         return len(self.transitions)
@@ -193,10 +199,29 @@ class TaggedReplayBuffer:
         written = [
             self._rows_of(episode, tag) for episode, (_, tag) in zip(episodes, tagged, strict=True)
         ]  # before anything is written: the encoder may fail
+        self._warn_of_eviction(sum(len(rows) for _, rows in written))
         indices = [self._store.write(frames, rows) for frames, rows in written]
         for view in self._views.values():
             view.sampler.refresh()
         return torch.cat(indices) if indices else torch.zeros(0, dtype=torch.long)
+
+    def _warn_of_eviction(self, steps: int) -> None:
+        """Say it, once, when rows of demonstrations are overwritten: what they alone show is forgotten."""
+        there, over = self.write_count, self.write_count + steps - self.capacity
+        if self._warned or over <= 0:
+            return
+        going = torch.arange(max(there - self.capacity, 0), min(over, there)) % self.capacity
+        tags = self.transitions.storage[going.to(self.device)]["tag"] if len(going) else torch.zeros(0)
+        lost = {tag: int((tags == int(tag)).sum()) for tag in Tag if tag != Tag.ONLINE}
+        if any(lost.values()) or over > there:
+            self._warned = True
+            told = ", ".join(f"{count} of {tag.name.lower()}" for tag, count in lost.items() if count)
+            warnings.warn(
+                f"A buffer of {self.capacity} transitions is full and overwrites its oldest, offline data among them: "
+                f"{told or f'{over - there} of those that are being added'}. Give it a capacity for all to come.",
+                DataWarning,
+                stacklevel=4,
+            )
 
     def _rows_of(self, episode: TensorDictBase, tag: Tag) -> tuple[TensorDict, TensorDict]:
         """Observations ``[T + 1]`` and transitions ``[T]`` of an episode."""

@@ -9,6 +9,9 @@ from ls3_torchrl.modules import PixelEncoder
 D = 4
 SCALE = 0.5
 
+# Rings are to wrap round here, whatever is in them.
+pytestmark = pytest.mark.filterwarnings("ignore:A buffer of .* is full:ls3_torchrl.data.DataWarning")
+
 
 def reading_encoder(factor=1.0):
     """An encoder whose loc[0] is ``factor`` times an image's grey value in 0…255, and scale is SCALE."""

@@ -14,6 +14,9 @@ from ls3_torchrl.data import EpisodeKeys, TaggedReplayBuffer, episode_from_array
 KEYS = EpisodeKeys(("agent", "state"), ("agent", "action"), ("next", "cost"), ("next", "hit"), ("next", "there"))
 OPTIONS = {"latent_dim": 2, "gamma": 0.9, "continue_failures": True, "success_tail": 2, "keys": KEYS}
 
+# Rings are to wrap round here, whatever is in them.
+pytestmark = pytest.mark.filterwarnings("ignore:A buffer of .* is full:ls3_torchrl.data.DataWarning")
+
 
 class Spread(nn.Module):
     def __init__(self):

@@ -399,3 +399,26 @@ def test_sets_that_differ_are_refused():
     wide["action"] = torch.zeros(4, 3)
     with pytest.raises(ValueError, match=r"The sets of episodes: 'action' differs"):
         check_datasets({Tag.SUCCESS: [episode(4)], Tag.RAND: [wide]}, keys=KEYS)
+
+
+# --- what a full buffer forgets ---------------------------------------------------------------------------------
+
+
+def test_offline_data_are_not_overwritten_without_a_word():
+    buffer = TaggedReplayBuffer(10, latent_dim=2, keys=KEYS)
+    buffer.add([episode(4), episode(4)], "success")
+    with pytest.warns(DataWarning, match=r"10 transitions is full.*offline data among them: 2 of success.*capacity"):
+        buffer.add(episode(4), "online")
+    buffer.add(episode(4), "online")  # once is enough
+
+
+def test_online_data_are_overwritten_without_ado():
+    buffer = TaggedReplayBuffer(10, latent_dim=2, keys=KEYS)
+    for _ in range(9):
+        buffer.add(episode(4), "online")
+    assert len(buffer) == 10
+
+
+def test_a_set_larger_than_the_buffer_is_warned_of():
+    with pytest.warns(DataWarning, match="2 of those that are being added"):
+        TaggedReplayBuffer(10, latent_dim=2, keys=KEYS).add([episode(4)] * 3, "success")
