@@ -42,7 +42,9 @@ def usable_device(device: torch.device | str) -> torch.device:
         torch.empty(0, device=found)
     except (TypeError, RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).partition("\n")[0].rstrip(".")
-        raise ValueError(f"device {device!r} cannot be used here: {reason}. Use device='cpu', or one there is.") from None
+        raise ValueError(
+            f"device {device!r} cannot be used here: {reason}. Use device='cpu', or one there is."
+        ) from None
     return found
 
 

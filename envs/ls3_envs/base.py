@@ -253,7 +253,9 @@ class VisualConstraintEnv(EnvBase):
         """The action in float32, on the environments' device."""
         space = self.action_spec.space
         if not isinstance(action, Tensor):
-            raise KeyError("The tensordict has no tensor 'action'. Set it before env.step, or pass a policy to rollout.")
+            raise KeyError(
+                "The tensordict has no tensor 'action'. Set it before env.step, or pass a policy to rollout."
+            )
         if action.dtype == torch.bool or action.is_complex():
             raise TypeError(f"An action must consist of floating-point or whole numbers, got dtype {action.dtype}.")
         if action.shape != space.low.shape:

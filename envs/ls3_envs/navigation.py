@@ -100,6 +100,8 @@ class NavigationEnv(VisualConstraintEnv):
 
     def _initial_state(self, index: int, generator: np.random.Generator) -> Tensor:
         noise = generator.normal(scale=NOISE_STD, size=(self.horizon, 2))
+        if self._noise.is_inference():  # made in inference mode, it could not be written to outside
+            self._noise = self._noise.clone()
         self._noise[index] = torch.as_tensor(noise, dtype=torch.float32)
         if self.start == "fixed":
             return torch.as_tensor(generator.normal(START, START_STD), dtype=torch.float32)

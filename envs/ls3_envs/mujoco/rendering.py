@@ -73,7 +73,10 @@ class RayTracer:
         number = check_camera(model, camera, size)
         self.size, self.num_envs = size, num_envs
         self._mjw, self._wp, self._device = mjw, wp, wp_device(torch.device(device))
-        self._copy = partial(RayTracer, camera=camera, size=size, num_envs=num_envs, device=device, groups=groups), model
+        self._copy = (
+            partial(RayTracer, camera=camera, size=size, num_envs=num_envs, device=device, groups=groups),
+            model,
+        )
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)  # a fixed camera has its pose only after it
         with wp.ScopedDevice(self._device):
