@@ -1,8 +1,8 @@
 """Makes MuJoCo importable whatever ``MUJOCO_GL`` says: pictures are ray-traced here and need no OpenGL.
 
-MuJoCo loads the OpenGL library that the variable names while it is imported, and where that fails, nothing of MuJoCo can
-be used. TorchRL imports MuJoCo wherever it is installed, so that even domains without it would fail. Hence this module is
-the first that the package imports.
+MuJoCo loads the OpenGL library that the variable names while it is imported, and where that fails, nothing of MuJoCo
+can be used. TorchRL imports MuJoCo wherever it is installed, so that even domains without it would fail. Hence this
+module is the first that the package imports.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def import_mujoco() -> None:
     if chosen is None or "mujoco" in sys.modules:
         return
     try:
-        import mujoco  # noqa: F401
+        import mujoco
     except ImportError:  # not installed, which is said where a domain needs it
         return
     except Exception as error:

@@ -36,8 +36,9 @@ class VisualConstraintEnv(EnvBase):
     whose states are points of a plane also :meth:`plane` and :meth:`advance_noiseless`, which pictures use.
 
     An action is ``[N, A]``, one row for each environment, of floating-point or whole numbers, and computed with in
-    float32. One of another shape, outside the box or not finite is refused, and whatever a step raises, the environments
-    are as they were before it. Steps after the end of an episode go on, each of them ``truncated``, until a reset.
+    float32. One of another shape, outside the box or not finite is refused, and whatever a step raises, the
+    environments are as they were before it. Steps after the end of an episode go on, each of them ``truncated``, until
+    a reset.
 
     Copies, pickled ones too, share nothing with the original and go on as it does.
 

@@ -17,10 +17,8 @@ def available_cores() -> int:
         >>> available_cores() >= 1
         True
     """
-    if hasattr(os, "sched_getaffinity"):
-        cores = len(os.sched_getaffinity(0))
-    else:
-        cores = os.cpu_count() or 1
+    pinned = hasattr(os, "sched_getaffinity")  # not on macOS and Windows
+    cores = len(os.sched_getaffinity(0)) if pinned else os.cpu_count() or 1
     quota = _quota(_CGROUP)
     return max(1, cores if quota is None else min(cores, round(quota)))
 

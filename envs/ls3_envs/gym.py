@@ -83,7 +83,8 @@ class _Batch:
         if not (excess <= ACTION_TOLERANCE).all():  # also catches NaN
             raise ValueError(
                 f"An action lies outside the action space or is not finite: received values from {own.min():.4g} to "
-                f"{own.max():.4g}, allowed are -1 to 1, which stand for the domain's own box. Clip it to the action space."
+                f"{own.max():.4g}, allowed are -1 to 1, which stand for the domain's own box. "
+                "Clip it to the action space."
             )
         return own
 
