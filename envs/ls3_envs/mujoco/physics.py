@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import weakref
 from copy import copy
 from functools import partial
 from typing import Any, Protocol
@@ -34,6 +35,21 @@ class Physics(Protocol):
         """
 
 
+_WITH_THREADS: weakref.WeakSet[MujocoPhysics] = weakref.WeakSet()
+_LEFT_BEHIND: list[Rollout | None] = []
+
+
+def _leave_threads_behind() -> None:
+    """After a fork: threads did not come along, and their pool, even when it is deleted, would wait for them for ever."""
+    for physics in _WITH_THREADS:
+        _LEFT_BEHIND.append(physics._rollout)
+        physics._rollout = None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_threads_behind)
+
+
 class MujocoPhysics:
     """C MuJoCo through ``mujoco.rollout``: the default, and on CPUs by far the fastest.
 
@@ -62,12 +78,10 @@ class MujocoPhysics:
             )
         self._threads = threads
         self._data = [mujoco.MjData(self.model) for _ in range(threads)]
-        self._start_threads()
-
-    def _start_threads(self) -> None:
         # A pool of one thread costs more than calling it here.
-        self._rollout = Rollout(nthread=self._threads if self._threads > 1 else 0)
-        self._process = os.getpid()
+        self._make_rollout = partial(Rollout, nthread=threads if threads > 1 else 0)
+        self._rollout: Rollout | None = None
+        _WITH_THREADS.add(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Threads cannot be copied, and every step starts afresh: a new one of the same model goes on in the same way.
@@ -75,8 +89,8 @@ class MujocoPhysics:
 
     def __call__(self, state: Tensor, control: Tensor) -> Tensor:
         """States after the last substep; see :class:`Physics`."""
-        if self._process != os.getpid():  # threads do not survive a fork: the pool would be waited for for ever
-            self._start_threads()
+        if self._rollout is None:
+            self._rollout = self._make_rollout()
         start = np.concatenate([np.zeros((len(state), 1)), state.cpu().numpy()], axis=1)
         reached, _ = self._rollout.rollout(
             self.model, self._data, start, control.cpu().numpy(), control_spec=int(mujoco.mjtState.mjSTATE_CTRL)
