@@ -6,6 +6,7 @@ imported when they are first asked for: importing this package needs no MuJoCo.
 
 from typing import Any
 
+import ls3_envs._mujoco_gl  # noqa: F401  (before TorchRL, which imports MuJoCo)
 from ls3_envs.base import VisualConstraintEnv
 from ls3_envs.gym import GymEnv, GymVectorEnv
 from ls3_envs.lazy import Lazy

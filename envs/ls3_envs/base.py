@@ -12,10 +12,12 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from ls3_envs._checks import usable_device, whole_number
 from ls3_envs.plane import Plane
+from ls3_envs.seeding import checked_seed, process_id, unused_seed
 
 #: How far outside the box an action may lie before it counts as a mistake: rounding, no more.
-_ACTION_TOLERANCE = 1e-4
+ACTION_TOLERANCE = 1e-4
 
 
 class VisualConstraintEnv(EnvBase):
@@ -33,6 +35,13 @@ class VisualConstraintEnv(EnvBase):
     A domain defines five methods: ``_initial_state``, ``_advance``, ``_render``, ``_violates`` and ``_succeeds``; one
     whose states are points of a plane also :meth:`plane` and :meth:`advance_noiseless`, which pictures use.
 
+    An action is ``[N, A]``, one row for each environment, of floating-point or whole numbers, and computed with in
+    float32. One of another shape, outside the box or not finite is refused, and whatever a step raises, the
+    environments are as they were before it. Steps after the end of an episode go on, each of them ``truncated``, until
+    a reset.
+
+    Copies, pickled ones too, share nothing with the original and go on as it does.
+
     Args:
         num_envs: how many environments N are stepped in one call; at least 1.
         state_dim: size of the low-dimensional state.
@@ -41,11 +50,15 @@ class VisualConstraintEnv(EnvBase):
         horizon: steps in an episode, at least 1.
         image_size: side of the square image in pixels.
         device: where states and images live.
-        seed: seed of the environments' random streams; drawn from torch's global generator when ``None``.
+        seed: seed of the environments' random streams, a whole number from 0. When ``None`` it is drawn from torch's
+            global generator; in a worker process, which may have inherited that one, from the operating system. Taken
+            to another process, environments without a seed draw a new one at their next reset.
 
     Raises:
-        ValueError: for fewer than one environment or step; by ``step`` for an action of another shape, outside the box
-            or not finite.
+        ValueError: for fewer than one environment or step, a negative seed, or a device that is not there; by ``step``
+            for an action of another shape, outside the box or not finite.
+        TypeError: for numbers of environments, steps and seeds that are not whole; by ``step`` for an action that does
+            not consist of numbers.
         RuntimeError: by ``step`` before the first ``reset``.
     """
 
@@ -61,11 +74,12 @@ class VisualConstraintEnv(EnvBase):
         device: torch.device | str = "cpu",
         seed: int | None = None,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}.")
-        if horizon < 1:
-            raise ValueError(f"horizon must be at least 1 step, got {horizon}.")
-        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        num_envs = whole_number(num_envs, "num_envs")
+        horizon = whole_number(horizon, "horizon", unit=" step")
+        image_size = whole_number(image_size, "image_size", unit=" pixel")
+        if seed is not None:
+            seed = checked_seed(seed)
+        super().__init__(device=usable_device(device), batch_size=torch.Size([num_envs]))
         self.num_envs = num_envs
         self.horizon = horizon
         self.image_size = image_size
@@ -105,7 +119,8 @@ class VisualConstraintEnv(EnvBase):
         self._clock = torch.zeros(num_envs, dtype=torch.long, device=self.device)
         self._started = False
         self._generators: list[np.random.Generator] = []
-        self.set_seed(int(torch.randint(2**31 - 1, ())) if seed is None else seed)
+        self._unseeded: list[bytes | None] = []
+        self._set_seed(seed)
 
     @abstractmethod
     def _initial_state(self, index: int, generator: np.random.Generator) -> Tensor:
@@ -168,20 +183,58 @@ class VisualConstraintEnv(EnvBase):
             "A domain that has a plane() defines advance_noiseless(state, action), too."
         )
 
+    def render_frames(self, size: int) -> Tensor:
+        """All as they are now, in colour, at another size for videos: uint8 ``[N, 3, size, size]``.
+
+        A domain that can draw itself at any size overrides it; here the frames of :meth:`render_rgb` are enlarged.
+
+        Args:
+            size: side of the frames in pixels.
+        """
+        frames = self.render_rgb().float()
+        return torch.nn.functional.interpolate(frames, (size, size), mode="nearest").to(torch.uint8)
+
     def _set_seed(self, seed: int | None) -> None:
-        entropy = 0 if seed is None else int(seed)
-        self._generators = [
-            np.random.default_rng(np.random.SeedSequence([entropy, index])) for index in range(self.num_envs)
-        ]
+        entropy = unused_seed() if seed is None else checked_seed(seed)
+        self._generators = [_stream(entropy, index) for index in range(self.num_envs)]
+        #: Of each environment without a seed, the process in which its stream was begun.
+        self._unseeded = [process_id() if seed is None else None] * self.num_envs
+
+    def set_seeds(self, seeds: Sequence[int | None]) -> None:
+        """Give each environment a seed of its own: it then goes the way that it goes alone under that seed.
+
+        Args:
+            seeds: one whole number from 0 for each environment; one with ``None`` goes on with its stream.
+
+        Raises:
+            ValueError: for another number of seeds, or a negative one.
+            TypeError: for a seed that is no whole number.
+        """
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seeds must be {self.num_envs}, one for each environment; got {len(seeds)}.")
+        checked = [None if seed is None else checked_seed(seed, f"seeds[{i}]") for i, seed in enumerate(seeds)]
+        for index, seed in enumerate(checked):
+            if seed is not None:
+                self._generators[index], self._unseeded[index] = _stream(seed, 0), None
+
+    def _leave_other_processes_streams(self) -> None:
+        """New streams where one without a seed was begun in another process, whose copies may all go on with it."""
+        if any(begun not in (None, process_id()) for begun in self._unseeded):
+            entropy = unused_seed()
+            for index, begun in enumerate(self._unseeded):
+                if begun not in (None, process_id()):
+                    self._generators[index], self._unseeded[index] = _stream(entropy, index), process_id()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = torch.arange(self.num_envs) if mask is None else mask.reshape(self.num_envs).nonzero().flatten().cpu()
+        self._leave_other_processes_streams()
+        state, clock, frozen = self._state.clone(), self._clock.clone(), self._frozen.clone()
         for index in rows.tolist():
-            self._state[index] = self._initial_state(index, self._generators[index]).to(self._state)
-        self._started = True
-        self._clock[rows] = 0
-        self._frozen[rows] = self._violates(self._state)[rows]
+            state[index] = self._initial_state(index, self._generators[index]).to(state)
+        clock[rows] = 0
+        frozen[rows] = self._violates(state)[rows]
+        self._state, self._clock, self._frozen, self._started = state, clock, frozen, True
         return self._observe()
 
     def _observe(self) -> TensorDict:
@@ -197,27 +250,43 @@ class VisualConstraintEnv(EnvBase):
             device=self.device,
         )
 
-    def _check_action(self, action: Tensor) -> None:
+    def _checked_action(self, action: Tensor | None) -> Tensor:
+        """The action in float32, on the environments' device."""
         space = self.action_spec.space
+        if not isinstance(action, Tensor):
+            raise KeyError(
+                "The tensordict has no tensor 'action'. Set it before env.step, or pass a policy to rollout."
+            )
+        if action.dtype == torch.bool or action.is_complex():
+            raise TypeError(f"An action must consist of floating-point or whole numbers, got dtype {action.dtype}.")
         if action.shape != space.low.shape:
             raise ValueError(
                 f"An action must have shape {list(space.low.shape)}, one row for each environment; "
                 f"got {list(action.shape)}."
             )
+        action = action.detach().to(space.low)
         excess = torch.maximum(space.low - action, action - space.high).amax()
-        if not excess <= _ACTION_TOLERANCE:  # also catches NaN
+        if not excess <= ACTION_TOLERANCE:  # also catches NaN
             raise ValueError(
                 f"An action lies outside the action spec or is not finite: received values from "
                 f"{action.amin().item():.4g} to {action.amax().item():.4g}, allowed are "
                 f"{space.low[0].tolist()} to {space.high[0].tolist()}. "
                 "Pass it through env.action_spec.project(action) first."
             )
+        return action
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if not self._started:
             raise RuntimeError("The environment was stepped before its first reset. Call env.reset() first.")
-        action = tensordict.get("action")
-        self._check_action(action)
+        action = self._checked_action(tensordict.get("action", None))
+        before = self._state, self._clock, self._frozen
+        try:
+            return self._stepped(action)
+        except BaseException:
+            self._state, self._clock, self._frozen = before
+            raise
+
+    def _stepped(self, action: Tensor) -> TensorDict:
         moved = self._advance(self._state, action)
         self._state = torch.where(self._frozen, self._state, moved)
         self._clock = self._clock + 1
@@ -233,3 +302,8 @@ class VisualConstraintEnv(EnvBase):
             }
         )
         return out
+
+
+def _stream(seed: int, index: int) -> np.random.Generator:
+    """The random stream of the environment ``index`` under a seed."""
+    return np.random.default_rng(np.random.SeedSequence([seed, index]))

@@ -80,10 +80,8 @@ class NavigationEnv(VisualConstraintEnv):
         )
         self.start = start
         # An episode's noise is sampled at reset from each environment's own stream: rows stay independent, steps fast.
-        self._noise = torch.zeros(num_envs, horizon, 2, device=self.device)
-        centre = (torch.arange(self.image_size, device=self.device) + 0.5) / self.image_size
-        self._pixel_x, self._pixel_y = centre * WINDOW[0], centre * WINDOW[1]
-        self._background = self._render_background()
+        self._noise = torch.zeros(self.num_envs, self.horizon, 2, device=self.device)
+        self._canvas = _Canvas(self.image_size, self.device)
 
     def plane(self, points: int = 60) -> Plane:
         """The window, y downwards, with wall and goal."""
@@ -102,6 +100,8 @@ class NavigationEnv(VisualConstraintEnv):
 
     def _initial_state(self, index: int, generator: np.random.Generator) -> Tensor:
         noise = generator.normal(scale=NOISE_STD, size=(self.horizon, 2))
+        if self._noise.is_inference():  # made in inference mode, it could not be written to outside
+            self._noise = self._noise.clone()
         self._noise[index] = torch.as_tensor(noise, dtype=torch.float32)
         if self.start == "fixed":
             return torch.as_tensor(generator.normal(START, START_STD), dtype=torch.float32)
@@ -121,24 +121,40 @@ class NavigationEnv(VisualConstraintEnv):
     def _succeeds(self, state: Tensor) -> Tensor:
         return (state - state.new_tensor(GOAL)).norm(dim=-1, keepdim=True) <= GOAL_RADIUS
 
-    def _render_background(self) -> Tensor:
+    def _render(self, state: Tensor) -> Tensor:
+        return self._canvas.draw(state)
+
+    def render_frames(self, size: int) -> Tensor:
+        """All as they are now, drawn at another size: uint8 ``[N, 3, size, size]``."""
+        return _Canvas(size, self.device).draw(self._state)
+
+
+class _Canvas:
+    """Pictures of the window with ``size`` pixels a side: wall and disc, with soft edges."""
+
+    def __init__(self, size: int, device: torch.device) -> None:
+        centre = (torch.arange(size, device=device) + 0.5) / size
+        self.size = size
+        self.x, self.y = centre * WINDOW[0], centre * WINDOW[1]
+
         def coverage(centre: Tensor, low: float, high: float, width: float) -> Tensor:
             covered = (centre + width / 2).clamp(max=high) - (centre - width / 2).clamp(min=low)
             return (covered / width).clamp(0.0, 1.0)
 
-        x = coverage(self._pixel_x, WALL_LOW[0], WALL_HIGH[0], WINDOW[0] / self.image_size)
-        y = coverage(self._pixel_y, WALL_LOW[1], WALL_HIGH[1], WINDOW[1] / self.image_size)
-        blue = torch.tensor(_BLUE, device=self.device).view(3, 1, 1)
-        return blue * (y[:, None] * x[None, :])
+        x = coverage(self.x, WALL_LOW[0], WALL_HIGH[0], WINDOW[0] / size)
+        y = coverage(self.y, WALL_LOW[1], WALL_HIGH[1], WINDOW[1] / size)
+        blue = torch.tensor(_BLUE, device=device).view(3, 1, 1)
+        self.background = blue * (y[:, None] * x[None, :])
 
-    def _render(self, state: Tensor) -> Tensor:
-        dx = self._pixel_x - state[:, :1]
-        dy = self._pixel_y - state[:, 1:]
+    def draw(self, state: Tensor) -> Tensor:
+        """Pictures uint8 ``[n, 3, size, size]`` of discs at ``[n, 2]``."""
+        dx = self.x - state[:, :1]
+        dy = self.y - state[:, 1:]
         distance = (dy[:, :, None].square() + dx[:, None, :].square()).sqrt()
-        softness = (WINDOW[0] + WINDOW[1]) / (2 * self.image_size)  # one pixel: an antialiased edge
+        softness = (WINDOW[0] + WINDOW[1]) / (2 * self.size)  # one pixel: an antialiased edge
         disc = (0.5 + (DISC_RADIUS - distance) / softness).clamp(0.0, 1.0)[:, None]
-        red = torch.tensor(_RED, device=self.device).view(1, 3, 1, 1)
-        return torch.lerp(self._background.expand(state.shape[0], -1, -1, -1), red, disc).round().to(torch.uint8)
+        red = torch.tensor(_RED, device=state.device).view(1, 3, 1, 1)
+        return torch.lerp(self.background.expand(state.shape[0], -1, -1, -1), red, disc).round().to(torch.uint8)
 
 
 def _inside_window(position: Tensor) -> Tensor:

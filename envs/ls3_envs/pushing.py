@@ -123,7 +123,7 @@ class SequentialPushingEnv(MujocoEnv):
         image_size: side of the image in pixels.
         physics: ``"mujoco"``, or ``"warp"`` for a GPU.
         renderer: ``"raytrace"``, or ``"egl"``.
-        threads: that share the physics; the machine's cores when ``None``.
+        threads: that share the physics; the cores that this process may use when ``None``.
         device: of states and pictures.
         seed: of the environments' random streams.
 

@@ -103,7 +103,7 @@ class ReacherEnv(MujocoEnv):
         image_size: side of the image in pixels.
         physics: ``"mujoco"``, or ``"warp"`` for a GPU.
         renderer: ``"raytrace"``, or ``"egl"``.
-        threads: that share the physics; the machine's cores when ``None``.
+        threads: that share the physics; the cores that this process may use when ``None``.
         device: of states and pictures.
         seed: of the environments' random streams.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import multiprocessing
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -15,9 +17,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import CatFrames, Compose, InitTracker, Transform, TransformedEnv, UnaryTransform
 
+from ls3_envs._checks import check_options, nearest, usable_device, whole_number
 from ls3_envs.base import VisualConstraintEnv
 from ls3_envs.demonstrators.scripted import Scripted, collect_episodes
 from ls3_envs.lazy import Lazy
+from ls3_envs.seeding import checked_seed
 
 #: Episodes that are collected side by side: more would hold too many pictures at once.
 _SIDE_BY_SIDE = 100
@@ -37,6 +41,7 @@ class OfflineData:
 
     Raises:
         ValueError: for fewer than one episode.
+        TypeError: for a number of episodes that is not whole, a policy that cannot be called or options without names.
     """
 
     episodes: int
@@ -44,8 +49,9 @@ class OfflineData:
     env_options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.episodes < 1:
-            raise ValueError(f"episodes must be at least 1, got {self.episodes}.")
+        whole_number(self.episodes, "episodes")
+        _check_callable(self.policy, "policy", "the scripted policy's class, or a Lazy of it")
+        _check_mapping(self.env_options, "env_options", "options of the environment by name")
 
 
 @dataclass(frozen=True)
@@ -59,10 +65,14 @@ class Domain:
         offline: the offline data by the paper's names ``success``, ``rand`` and ``constraint``.
         frames: pictures that are stacked into one observation, where one alone does not show velocities.
         frame_stride: steps between them; what moves less than a pixel a step is seen to move over several.
+        horizon: steps of an episode when no other number is asked for, which Gymnasium's spec says as
+            ``max_episode_steps``. When ``None`` it is read from the default of the environment's own ``horizon``; a
+            ``Lazy`` cannot be asked.
 
     Raises:
-        ValueError: for an id that Gymnasium does not take, data of another name, fewer than one frame or a stride
-            below one step.
+        ValueError: for an id that Gymnasium does not take, data of another name, fewer than one frame or step, or a
+            stride below one step.
+        TypeError: for an environment that cannot be called, and other values of another type.
     """
 
     env: Callable[..., VisualConstraintEnv]
@@ -70,20 +80,50 @@ class Domain:
     offline: Mapping[str, OfflineData] = field(default_factory=dict)
     frames: int = 1
     frame_stride: int = 1
+    horizon: int | None = None
 
     def __post_init__(self) -> None:
+        _check_callable(self.env, "env", "the environment's class, or a Lazy of it")
+        if not isinstance(self.gym_id, str):
+            raise TypeError(f"gym_id must be a string such as 'namespace/Name-v0', got {self.gym_id!r}.")
         if not re.fullmatch(r"([\w:-]+/)?[\w:.-]+-v\d+", self.gym_id):
             raise ValueError(f"gym_id must read 'namespace/Name-v0', got {self.gym_id!r}.")
-        for kind in self.offline:
+        _check_mapping(self.offline, "offline", "OfflineData by 'success', 'rand' or 'constraint'")
+        for kind, data in self.offline.items():
             if kind not in KINDS:
                 raise ValueError(f"offline data must be called {', '.join(map(repr, KINDS))}, got {kind!r}.")
+            if not isinstance(data, OfflineData):
+                raise TypeError(f"offline[{kind!r}] must be an OfflineData, got {data!r}.")
         _check_frames(self.frames, self.frame_stride)
+        if self.horizon is not None:
+            whole_number(self.horizon, "horizon", unit=" step")
+
+    def default_horizon(self) -> int | None:
+        """Steps of an episode when no other number is asked for, as far as it is known without importing anything."""
+        if self.horizon is not None or isinstance(self.env, Lazy):
+            return self.horizon
+        try:
+            own = inspect.signature(self.env).parameters.get("horizon")
+        except (TypeError, ValueError):
+            return None
+        if own is None or own.default is own.empty or own.default is None:
+            return None
+        return whole_number(own.default, f"horizon of {getattr(self.env, '__name__', self.env)!s}", unit=" step")
 
 
 def _check_frames(frames: int, stride: int) -> None:
     for what, number in (("frames", frames), ("frame_stride", stride)):
-        if number < 1:
-            raise ValueError(f"{what} must be at least 1, got {number}.")
+        whole_number(number, what)
+
+
+def _check_callable(value: object, name: str, allowed: str) -> None:
+    if not callable(value):
+        raise TypeError(f"{name} must be {allowed}; got {value!r}.")
+
+
+def _check_mapping(value: object, name: str, allowed: str) -> None:
+    if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+        raise TypeError(f"{name} must be a mapping, {allowed}; got {value!r}.")
 
 
 _DOMAINS: dict[str, Domain] = {}
@@ -100,7 +140,8 @@ def register(name: str, row: Domain) -> None:
         row: what there is to say about it.
 
     Raises:
-        ValueError: for a name or a Gymnasium id that is taken.
+        ValueError: for a name or a Gymnasium id that is taken, or an empty name.
+        TypeError: for a name that is no string, or a row that is no :class:`Domain`.
 
     Example:
         >>> from ls3_envs.navigation import NavigationEnv
@@ -109,6 +150,12 @@ def register(name: str, row: Domain) -> None:
         7
         >>> unregister("my_navigation")
     """
+    if not isinstance(name, str):
+        raise TypeError(f"A domain's name must be a string, got {name!r}.")
+    if not name:
+        raise ValueError("A domain's name must not be empty: it is what make(name) is called with.")
+    if not isinstance(row, Domain):
+        raise TypeError(f"Domain {name!r} must be described by a Domain(env, gym_id, ...), got {row!r}.")
     if name in _DOMAINS:
         raise ValueError(f"Domain {name!r} is registered already. Choose another name, or unregister({name!r}) first.")
     if row.gym_id in gymnasium.registry:
@@ -117,6 +164,7 @@ def register(name: str, row: Domain) -> None:
         row.gym_id,
         entry_point="ls3_envs.gym:GymEnv",
         vector_entry_point="ls3_envs.gym:GymVectorEnv",
+        max_episode_steps=row.default_horizon(),
         kwargs={"domain": name},
     )
     _DOMAINS[name] = row
@@ -143,6 +191,7 @@ register(
             "success": OfflineData(50, Lazy("ls3_envs.demonstrators.navigation:NavigationDemonstrator")),
             "constraint": OfflineData(50, Lazy("ls3_envs.demonstrators.navigation:NavigationViolator"), _ANYWHERE),
         },
+        horizon=100,
     ),
 )
 register(
@@ -159,6 +208,7 @@ register(
         },
         frames=3,
         frame_stride=4,
+        horizon=100,
     ),
 )
 register(
@@ -170,6 +220,7 @@ register(
             "success": OfflineData(500, Lazy("ls3_envs.demonstrators.pushing:PushingDemonstrator")),
             "constraint": OfflineData(300, Lazy("ls3_envs.demonstrators.pushing:PushingViolator"), _ANYWHERE),
         },
+        horizon=150,
     ),
 )
 register(
@@ -182,6 +233,7 @@ register(
             "rand": OfflineData(150, Lazy("ls3_envs.demonstrators.cable_routing:CableWanderer")),
             "constraint": OfflineData(50, Lazy("ls3_envs.demonstrators.cable_routing:CableViolator")),
         },
+        horizon=50,
     ),
 )
 
@@ -191,9 +243,16 @@ def domain(name: str) -> Domain:
 
     Raises:
         ValueError: for an unknown domain; the message lists those there are.
+        TypeError: for a name that is no string.
     """
+    if not isinstance(name, str):
+        raise TypeError(f"A domain's name must be a string, got {name!r}. Known domains: {', '.join(sorted(DOMAINS))}.")
     if name not in DOMAINS:
-        raise ValueError(f"Unknown domain {name!r}. Known domains: {', '.join(sorted(DOMAINS))}.")
+        worker = multiprocessing.parent_process() is not None
+        raise ValueError(
+            f"Unknown domain {name!r}. Known domains: {', '.join(sorted(DOMAINS))}.{nearest(name, DOMAINS)}"
+            + (" A worker process has to register a domain of your own, too: outside of 'if __name__'." * worker)
+        )
     return DOMAINS[name]
 
 
@@ -230,7 +289,8 @@ def make(
         options: of the environment; see its class.
 
     Raises:
-        ValueError: for an unknown domain, fewer than one frame or a stride below one step.
+        ValueError: for an unknown domain, fewer than one frame or a stride below one step, and as the domain does.
+        TypeError: for an option that the environment does not have; the message lists those there are.
         ModuleNotFoundError: when the domain needs a package that is not installed.
 
     Example:
@@ -241,7 +301,9 @@ def make(
     frames = row.frames if frames is None else frames
     stride = row.frame_stride if frame_stride is None else frame_stride
     _check_frames(frames, stride)
-    return TransformedEnv(row.env(num_envs=num_envs, **options), Compose(*_stack(frames, stride), InitTracker()))
+    build = row.env.load() if isinstance(row.env, Lazy) else row.env
+    check_options(build, options)
+    return TransformedEnv(build(num_envs=num_envs, **options), Compose(*_stack(frames, stride), InitTracker()))
 
 
 def collect_offline(
@@ -260,7 +322,9 @@ def collect_offline(
         Episodes ``[N, T]``.
 
     Raises:
-        ValueError: when the domain has no such data or fewer than one episode is asked for.
+        ValueError: when the domain has no such data, for fewer than one episode, a negative seed or a device that is
+            not there.
+        TypeError: for a number of episodes or a seed that is not whole.
 
     Example:
         >>> collect_offline("navigation", "success", episodes=2).batch_size
@@ -270,9 +334,8 @@ def collect_offline(
     if kind not in kinds:
         raise ValueError(f"Domain {name!r} has no offline data {kind!r}; it has: {', '.join(sorted(kinds))}.")
     recipe = kinds[kind]
-    count = recipe.episodes if episodes is None else episodes
-    if count < 1:
-        raise ValueError(f"episodes must be at least 1, got {count}.")
+    count = recipe.episodes if episodes is None else whole_number(episodes, "episodes")
+    seed, device = checked_seed(seed), usable_device(device)
     parts = []
     for first in range(0, count, _SIDE_BY_SIDE):
         part = min(_SIDE_BY_SIDE, count - first)

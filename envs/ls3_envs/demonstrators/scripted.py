@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 
 import torch
@@ -20,7 +21,7 @@ class Scripted(TensorDictModuleBase):
         seed: of that noise.
 
     Raises:
-        ValueError: for a negative ``noise_std``.
+        ValueError: for a ``noise_std`` that is negative or not finite.
     """
 
     in_keys = ["state", "is_init"]  # noqa: RUF012
@@ -30,6 +31,8 @@ class Scripted(TensorDictModuleBase):
         super().__init__()
         if noise_std < 0:
             raise ValueError(f"noise_std must not be negative, got {noise_std}.")
+        if not math.isfinite(noise_std):
+            raise ValueError(f"noise_std must be finite, got {noise_std}.")
         self.limit, self.noise_std = limit, noise_std
         self._generator = torch.Generator().manual_seed(seed)
         self._step: Tensor | None = None

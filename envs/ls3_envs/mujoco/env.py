@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from typing import Literal
 
 import mujoco
@@ -14,7 +15,7 @@ from torchrl.data import Binary
 
 from ls3_envs.base import VisualConstraintEnv
 from ls3_envs.mujoco.physics import make_physics
-from ls3_envs.mujoco.rendering import View, make_renderer
+from ls3_envs.mujoco.rendering import Renderer, View, make_renderer
 
 PhysicsName = Literal["mujoco", "warp"]
 RendererName = Literal["raytrace", "egl"]
@@ -44,7 +45,7 @@ class MujocoEnv(VisualConstraintEnv):
         image_size: side of the image in pixels.
         physics: ``"mujoco"``, or ``"warp"`` for a GPU.
         renderer: ``"raytrace"``, or ``"egl"``.
-        threads: that C MuJoCo shares them between; the machine's cores when ``None``.
+        threads: that C MuJoCo shares them between; the cores that this process may use when ``None``.
         device: of states and pictures.
         seed: of the environments' random streams.
 
@@ -82,9 +83,11 @@ class MujocoEnv(VisualConstraintEnv):
         )
         self.model = model
         self.physics = make_physics(physics, model, num_envs=num_envs, device=self.device, threads=threads)
-        self.renderer = make_renderer(
-            renderer, model, camera, size=image_size, num_envs=num_envs, device=self.device, groups=groups
+        self._make_renderer = partial(
+            make_renderer, renderer, camera=camera, num_envs=num_envs, device=self.device, groups=groups
         )
+        self.renderer = self._make_renderer(model=model, size=image_size)
+        self._large: tuple[int, Renderer] | None = None
         self.observation_spec["physics_error"] = Binary(shape=(num_envs, 1), dtype=torch.bool, device=self.device)
         self._state = self._state.double()
         self._broken = torch.zeros_like(self._frozen)
@@ -110,6 +113,12 @@ class MujocoEnv(VisualConstraintEnv):
     def _render(self, state: Tensor) -> Tensor:
         return self._view(state).pixels
 
+    def render_frames(self, size: int) -> Tensor:
+        """All as they are now, in colour, drawn at another size: uint8 ``[N, 3, size, size]``, size 8 to 1024."""
+        if self._large is None or self._large[0] != size:
+            self._large = size, self._make_renderer(model=self.model, size=size)
+        return self._large[1](self._state[:, : self.model.nq]).pixels
+
     def _observe(self) -> TensorDict:
         return super()._observe().set("physics_error", self._broken.clone())
 
@@ -119,7 +128,15 @@ class MujocoEnv(VisualConstraintEnv):
         return super()._reset(tensordict, **kwargs)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out = super()._step(tensordict)
+        broken = self._broken
+        try:
+            return super()._step(tensordict)
+        except BaseException:
+            self._broken = broken
+            raise
+
+    def _stepped(self, action: Tensor) -> TensorDict:
+        out = super()._stepped(action)
         self._frozen = self._frozen | self._broken
         for key in ("truncated", "done"):
             out.set(key, out[key] | self._broken)

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import os
+import weakref
 from copy import copy
-from typing import Protocol
+from functools import partial
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
 import torch
 from mujoco.rollout import Rollout
 from torch import Tensor
+
+from ls3_envs._checks import whole_number
+from ls3_envs.cores import available_cores
 
 PHYSICS = ("mujoco", "warp")
 
@@ -30,6 +35,21 @@ class Physics(Protocol):
         """
 
 
+_WITH_THREADS: weakref.WeakSet[MujocoPhysics] = weakref.WeakSet()
+_LEFT_BEHIND: list[Rollout | None] = []
+
+
+def _leave_threads_behind() -> None:
+    """After a fork: threads did not come along, and their pool, even when it is deleted, would wait for them for ever."""
+    for physics in _WITH_THREADS:
+        _LEFT_BEHIND.append(physics._rollout)
+        physics._rollout = None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_threads_behind)
+
+
 class MujocoPhysics:
     """C MuJoCo through ``mujoco.rollout``: the default, and on CPUs by far the fastest.
 
@@ -38,10 +58,15 @@ class MujocoPhysics:
 
     Args:
         model: compiled; it must have no state beyond positions and velocities.
-        threads: that share the worlds; the machine's cores when ``None``.
+        threads: that share the worlds; the cores that this process may use when ``None``.
+
+    Raises:
+        ValueError: for fewer than one thread, or a model with more state than positions and velocities.
+        TypeError: for a number of threads that is not whole.
     """
 
     def __init__(self, model: mujoco.MjModel, *, threads: int | None = None) -> None:
+        threads = available_cores() if threads is None else whole_number(threads, "threads")
         self.model = copy(model)
         # A simulation that blows up is to show it, instead of silently starting again.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -51,13 +76,21 @@ class MujocoPhysics:
                 f"The model has {size - 1 - model.nq - model.nv} state variables beyond positions and velocities "
                 "(activations, plugins or histories), which these environments do not carry along. Remove them."
             )
-        threads = threads or os.cpu_count() or 1
+        self._threads = threads
         self._data = [mujoco.MjData(self.model) for _ in range(threads)]
         # A pool of one thread costs more than calling it here.
-        self._rollout = Rollout(nthread=threads if threads > 1 else 0)
+        self._make_rollout = partial(Rollout, nthread=threads if threads > 1 else 0)
+        self._rollout: Rollout | None = None
+        _WITH_THREADS.add(self)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Threads cannot be copied, and every step starts afresh: a new one of the same model goes on in the same way.
+        return partial(MujocoPhysics, threads=self._threads), (self.model,)
 
     def __call__(self, state: Tensor, control: Tensor) -> Tensor:
         """States after the last substep; see :class:`Physics`."""
+        if self._rollout is None:
+            self._rollout = self._make_rollout()
         start = np.concatenate([np.zeros((len(state), 1)), state.cpu().numpy()], axis=1)
         reached, _ = self._rollout.rollout(
             self.model, self._data, start, control.cpu().numpy(), control_spec=int(mujoco.mjtState.mjSTATE_CTRL)
@@ -86,6 +119,10 @@ class WarpPhysics:
             # Room for the contacts of every world, not only for those of the first pose.
             self._data = mjw.put_data(model, mujoco.MjData(model), nworld=num_envs, nconmax=64, njmax=256)
         self._step = mjw.step
+        self._arguments = (model, num_envs, device)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return WarpPhysics, self._arguments
 
     def __call__(self, state: Tensor, control: Tensor) -> Tensor:
         """States after the last substep; see :class:`Physics`."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import NamedTuple, Protocol
+from functools import partial
+from typing import Any, NamedTuple, Protocol
 
 import mujoco
 import numpy as np
@@ -72,6 +73,10 @@ class RayTracer:
         number = check_camera(model, camera, size)
         self.size, self.num_envs = size, num_envs
         self._mjw, self._wp, self._device = mjw, wp, wp_device(torch.device(device))
+        self._copy = (
+            partial(RayTracer, camera=camera, size=size, num_envs=num_envs, device=device, groups=groups),
+            model,
+        )
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)  # a fixed camera has its pose only after it
         with wp.ScopedDevice(self._device):
@@ -91,6 +96,11 @@ class RayTracer:
                 enable_emission=False,
                 enable_per_light_ambient=False,
             )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Nothing is kept from one picture to the next: one made anew draws the same.
+        make, model = self._copy
+        return make, (model,)
 
     def __call__(self, qpos: Tensor) -> View:
         """The view of poses ``[n, nq]``."""
@@ -147,8 +157,13 @@ class EGLRenderer:
         except Exception as error:
             raise RuntimeError(f"EGL does not work on this machine: {error}. {remedy}") from error
         self._model, self._data, self._camera = model, mujoco.MjData(model), camera
+        self._copy = partial(EGLRenderer, camera=camera, size=size, groups=groups), model
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = [group in groups for group in range(6)]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        make, model = self._copy
+        return make, (model,)
 
     def __call__(self, qpos: Tensor) -> View:
         """The view of poses ``[n, nq]``."""
