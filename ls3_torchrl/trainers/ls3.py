@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -12,10 +11,8 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.record.loggers import Logger
 
-from ls3_torchrl._checks import DataWarning
 from ls3_torchrl.agent import LS3Agent
 from ls3_torchrl.data import VALUE_TAGS, RowSelection, Tag, TaggedReplayBuffer
-from ls3_torchrl.data.conform import require_actions
 from ls3_torchrl.objectives import (
     ClassifierLoss,
     EnsembleDynamicsLoss,
@@ -23,6 +20,7 @@ from ls3_torchrl.objectives import (
     SafeSetLoss,
     TD1ValueLoss,
 )
+from ls3_torchrl.trainers.checks import require_actions_of, warn_of_missing_outcomes
 from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner, wants_bf16
 from ls3_torchrl.trainers.options import LS3Options
 
@@ -218,28 +216,6 @@ class LS3Trainer:
             rows.set("safe_set_weight", torch.where(timed_out, weight, 1.0))
         return rows
 
-    def _check_data(self) -> None:
-        """Find what cannot be learnt from before time is spent on it."""
-        keys, rows = self.buffer.keys, self.buffer.transitions.storage[:] if len(self.buffer) else None
-        if rows is None:
-            return  # the first draw says so
-        actions, size = rows.get(keys.action), self.agent.architecture.action_dim
-        if actions.shape[-1] != size:
-            raise ValueError(
-                f"The buffer's {keys.action!r} has {actions.shape[-1]} actions, the agent's networks have {size}. "
-                "Make the agent for the robot whose data these are."
-            )
-        if self.agent.action_spec is not None:
-            require_actions(actions, self.agent.action_spec, f"The buffer's {keys.action!r}")
-        for key, sense in ((keys.success, "success, so nothing tells the goal"), (keys.constraint, "violation")):
-            if not rows.get(key).any():
-                warnings.warn(
-                    f"The data hold no {sense}: {key!r} is false in all {len(rows)} steps. Add episodes that do, or "
-                    "check how it is computed.",
-                    DataWarning,
-                    stacklevel=3,
-                )
-
     def train_offline(self) -> None:
         """Train the latent models on the offline data (equations (2), (3), (4), (5) and the classifiers).
 
@@ -249,7 +225,8 @@ class LS3Trainer:
         Warns:
             DataWarning: where no step succeeds, or none violates a constraint.
         """
-        self._check_data()
+        require_actions_of(self.agent, self.buffer)
+        warn_of_missing_outcomes(self.buffer)
         steps = self.options.offline
         self._failure_value = None
         self.dynamics.train(steps.dynamics_steps, "Dynamics")
