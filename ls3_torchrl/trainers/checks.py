@@ -11,15 +11,15 @@ from ls3_torchrl.data.conform import require_actions
 
 
 def require_actions_of(agent: LS3Agent, buffer: TaggedReplayBuffer) -> None:
-    """Raise ``ValueError`` for actions of another number than the agent's, or outside the bounds that it was made for."""
+    """Raise ``ValueError`` for actions of another number than the agent's, or outside the bounds it was made for."""
     if not len(buffer):
         return  # the first draw says so
     key, size = buffer.keys.action, agent.architecture.action_dim
     actions = buffer.transitions.storage[:].get(key)
     if actions.shape[-1] != size:
         raise ValueError(
-            f"The buffer's {key!r} has {actions.shape[-1]} actions, the agent's networks have {size}. Make the agent for "
-            "the robot whose data these are."
+            f"The buffer's {key!r} has {actions.shape[-1]} actions, the agent's networks have {size}. Make the agent "
+            "for the robot whose data these are."
         )
     if agent.action_spec is not None:
         require_actions(actions, agent.action_spec, f"The buffer's {key!r}")
@@ -33,8 +33,8 @@ def warn_of_missing_outcomes(buffer: TaggedReplayBuffer) -> None:
     for key, what in ((keys.success, "success, so nothing tells the goal"), (keys.constraint, "violation")):
         if not rows.get(key).any():
             warnings.warn(
-                f"The data hold no {what}: {key!r} is false in all {len(rows)} steps. Add episodes that do, or check how "
-                "it is computed.",
+                f"The data hold no {what}: {key!r} is false in all {len(rows)} steps. Add episodes that do, or check "
+                "how it is computed.",
                 DataWarning,
                 stacklevel=3,
             )
