@@ -21,7 +21,7 @@ from ls3_recipes.plots.agent import plot_reconstructions
 from ls3_recipes.plots.plane import Field, maps, over_plane, plane_of
 from ls3_recipes.run_settings import RunSettings
 from ls3_torchrl import LS3Agent
-from ls3_torchrl._checks import require_at_least, require_choice, require_positive
+from ls3_torchrl._checks import require_at_least, require_choice, require_positive, require_unit_interval
 from ls3_torchrl.baselines import PixelFeatures, action_bounds
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.files import save_atomically
@@ -64,7 +64,7 @@ class ActorCriticSettings(PolicySettings):
     Args:
         penalty: λ, added to the reward of a violation; at most 0.
         initial_std: of an untrained actor, before squashing.
-        tau: of the lagged critics; a value that is wrong for ever sinks by 1 in 1 / tau steps.
+        tau: of the lagged critics, in (0, 1]; a value that is wrong for ever sinks by 1 in 1 / tau steps.
         zero_at_goal: the goal ends the task, whatever happens after.
         critic_steps: gradient steps offline.
         updates_per_step: gradient steps online, for each step of the environment.
@@ -84,6 +84,7 @@ class ActorCriticSettings(PolicySettings):
             raise ValueError(f"penalty is added to the reward of a violation: 0 or below, got {self.penalty}.")
         require_positive(self.initial_std, "initial_std")
         require_positive(self.tau, "tau")
+        require_unit_interval(self.tau, "tau")
         require_at_least(self.critic_steps, 0, "critic_steps")
         if self.updates_per_step < 0:
             raise ValueError(f"updates_per_step must be at least 0, got {self.updates_per_step}.")
@@ -104,6 +105,7 @@ class BaselineSettings(RunSettings):
 
     def __post_init__(self) -> None:
         """Refuse unknown encoders."""
+        super().__post_init__()
         require_choice(self.encoder, ("latents", "conv"), "encoder")
 
     @property

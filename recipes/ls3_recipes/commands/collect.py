@@ -67,4 +67,4 @@ def collect(settings: CollectSettings) -> Path:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    run_command("collect", CollectSettings, collect, arguments, help_text=HELP, groups=("task",))
+    run_command("collect", CollectSettings, collect, arguments, help_text=HELP)

@@ -38,7 +38,7 @@ class ReportSettings:
         output: a folder that does not exist yet.
     """
 
-    runs: tuple[str, ...] = ()
+    runs: tuple[str, ...] | str = ()
     output: str
 
     def __post_init__(self) -> None:
