@@ -73,7 +73,7 @@ def from_signatures(
 
 def _hints(sources: Iterable[Callable[..., Any]]) -> dict[str, Any]:
     """The annotations of callables' arguments, of dataclasses their fields'."""
-    out = {}
+    out: dict[str, Any] = {}
     for source in sources:
         constructor = isinstance(source, type) and not dataclasses.is_dataclass(source)
         out |= get_type_hints(source.__init__ if constructor else source)  # type: ignore[misc]

@@ -60,8 +60,8 @@ def check(
     Raises:
         ValueError: naming the argument, and the nearest that there is.
     """
-    parsed, seen = parse(overrides), {}
-    for override in parsed:
+    seen: dict[str, str] = {}
+    for override in parse(overrides):
         name, line = override.get_key_element().lstrip("+~"), str(override.input_line)
         if name.startswith(("hydra.", "hydra/")):
             continue

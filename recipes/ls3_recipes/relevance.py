@@ -1,4 +1,4 @@
-"""Which settings are an algorithm's own: what files bring for others is left out, what arguments set for them refused."""
+"""Which settings are an algorithm's own: what files bring for others is left out, arguments refused."""
 
 from __future__ import annotations
 

@@ -101,7 +101,11 @@ class RunFolder:
 
     def __init__(self, path: str | Path, settings: Mapping[str, Any]) -> None:
         self.path = require_new(path)
-        self.path.mkdir(parents=True)
+        try:
+            self.path.mkdir(parents=True)
+        except FileExistsError:  # another run was quicker
+            require_new(path)
+            raise
         save_text_atomically(OmegaConf.to_yaml(OmegaConf.create(dict(settings))), self.path / "config.yaml")
         self.write_json("versions.json", versions())
         self.logger = RunLogger(self.path)
@@ -160,6 +164,23 @@ def require_writable(path: str | Path, name: str) -> None:
         raise ValueError(f"{name}={path} cannot be made: {parent} cannot be written to. Choose another place.")
     if any(len(os.fsencode(part)) > _LONGEST_NAME for part in Path(path).parts):
         raise ValueError(f"{name}={path} cannot be made: the name is too long. Choose a shorter one.")
+
+
+def require_folder(path: str | Path, name: str) -> None:
+    """Refuse a folder to work in that is no folder, or that cannot be written to or made.
+
+    Args:
+        path: of the folder; it may exist.
+        name: of the setting.
+
+    Raises:
+        ValueError: naming what is in the way.
+    """
+    path = Path(path)
+    if not os.path.lexists(path):
+        require_writable(path, name)
+    elif not path.is_dir() or not os.access(path, os.W_OK | os.X_OK):
+        raise ValueError(f"{name}={path} is no folder that can be written to. Choose another place.")
 
 
 def versions() -> dict[str, str]:

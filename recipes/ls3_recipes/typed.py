@@ -20,8 +20,8 @@ def typed(value: Any, hint: Any, name: str) -> Any:
 
     Args:
         value: as YAML or the command line gave it.
-        hint: the annotation: ``bool``, ``int``, ``float``, ``str``, ``None``, ``Literal``, ``tuple`` of these, a union of
-            these, or ``Any``.
+        hint: the annotation: ``bool``, ``int``, ``float``, ``str``, ``None``, ``Literal``, ``tuple`` of these, a union
+            of these, or ``Any``.
         name: of the setting, with its section.
 
     Returns:

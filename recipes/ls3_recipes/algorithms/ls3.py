@@ -14,9 +14,10 @@ from torchrl.envs import TransformedEnv
 from torchrl.record.loggers import Logger
 
 from ls3_recipes.algorithms.base import Algorithm, make_agent
+from ls3_recipes.figures import as_one_shape
 from ls3_recipes.options import as_dict, errors_of, from_signatures
-from ls3_recipes.plots.agent import plot_agent
-from ls3_recipes.plots.style import Label
+from ls3_recipes.plots.agent import pictures_of_agent
+from ls3_recipes.plots.style import Label, Pictures
 from ls3_recipes.run_settings import EpisodeSettings, RunSettings, check_buffer, require_within
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
@@ -90,8 +91,8 @@ class LS3Settings(RunSettings):
         if as_dict(self.buffer)["continue_failures"] and as_dict(self.buffer)["gamma"] == 1.0:
             raise ValueError(
                 "buffer.gamma must be below 1 with buffer.continue_failures=true, got 1.0: a failure that goes on for "
-                "ever would return minus infinity. Lower it, for example to 0.99, or set buffer.continue_failures=false "
-                "and loss.monte_carlo=false."
+                "ever would return minus infinity. Lower it, for example to 0.99, or set "
+                "buffer.continue_failures=false and loss.monte_carlo=false."
             )
         if self.loss.monte_carlo and not as_dict(self.buffer)["continue_failures"]:
             raise ValueError(
@@ -162,9 +163,9 @@ class LS3(Algorithm):
         """Take the networks of such a file; one of another shape, or with actions in other units, is refused."""
         self.agent.load_state_dict(LS3Agent.load(path, **asdict(self.agent.architecture)).state_dict())
 
-    def plot(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> None:
+    def pictures(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> Pictures:
         """Reconstructions, timelines, and maps and plans where the states are a plane."""
-        plot_agent(folder, self.settings, self.agent, self.policy, offline, evaluation)
+        return pictures_of_agent(folder, self.settings, self.agent, self.policy, offline, evaluation)
 
 
 def probe(agent: LS3Agent, offline: list[TensorDictBase], evaluation: TensorDictBase, horizon: int) -> dict[str, float]:
@@ -172,6 +173,7 @@ def probe(agent: LS3Agent, offline: list[TensorDictBase], evaluation: TensorDict
 
     Nothing where the episodes keep no state, or are shorter than the horizon.
     """
+    offline = [as_one_shape(part) for part in offline]
     episodes = [*offline, evaluation]
     if any(part.get("state", None) is None for part in episodes) or evaluation.shape[1] < horizon:
         return {}
