@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase, is_leaf_nontensor
@@ -66,7 +66,7 @@ def _write_file(path: Path, parts: Iterable[Tensor]) -> tuple[list[int], torch.d
             for part in parts:  # by ordinary writes: through memory, a full disk would kill the process
                 values = part.detach().cpu().contiguous()
                 if values.numel():
-                    file.write(values.reshape(-1).view(torch.uint8).numpy())
+                    file.write(cast(Any, values.reshape(-1).view(torch.uint8).numpy()))
                 count, shape, dtype = count + len(part), list(part.shape[1:]), part.dtype
     except OSError as error:
         raise OSError(error.errno, f"{error.strerror}: an array could not be written", str(path)) from error
@@ -110,9 +110,9 @@ def _read_folder(folder: Path, at: tuple[str, ...], arrays: dict[tuple[str, ...]
 
 def _read_file(path: Path, meta: Path, name: str, entry: dict[str, Any], remedy: str) -> Tensor:
     dtype, shape = getattr(torch, str(entry["dtype"]).removeprefix("torch."), None), entry.get("shape")
-    sizes = isinstance(shape, list) and all(type(size) is int and size >= 0 for size in shape)
-    if not isinstance(dtype, torch.dtype) or not sizes or entry.get("is_nested"):
+    if not isinstance(dtype, torch.dtype) or entry.get("is_nested") or not _is_shape(shape):
         raise ValueError(f"{meta} is damaged: it describes {name!r} by {entry!r}. {remedy}")
+    assert shape is not None
     count = math.prod(shape)
     if count == 0:
         return torch.empty(shape, dtype=dtype)  # there may be no file
@@ -123,3 +123,7 @@ def _read_file(path: Path, meta: Path, name: str, entry: dict[str, Any], remedy:
     if there != needed:
         raise ValueError(f"{path} is damaged: it has {there} bytes, but {shape} of {dtype} are {needed}. {remedy}")
     return torch.from_file(str(path), shared=False, size=count, dtype=dtype).reshape(shape)
+
+
+def _is_shape(shape: Any) -> bool:
+    return isinstance(shape, list) and all(type(size) is int and size >= 0 for size in shape)

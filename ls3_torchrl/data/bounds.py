@@ -21,8 +21,8 @@ def require_within(actions: Tensor, spec: TensorSpec, name: str) -> None:
     size = spec.shape[-1] if spec.shape else 1
     if actions.shape[-1] != size:
         raise ValueError(
-            f"{name}: actions have {actions.shape[-1]} dimensions, but those of the action spec {size}. Use data of the "
-            "same actions."
+            f"{name}: actions have {actions.shape[-1]} dimensions, but those of the action spec {size}. "
+            "Use data of the same actions."
         )
     low, high = getattr(spec.space, "low", None), getattr(spec.space, "high", None)
     if low is None or high is None or actions.numel() == 0:
@@ -35,6 +35,6 @@ def require_within(actions: Tensor, spec: TensorSpec, name: str) -> None:
         which = outside[0]
         raise ValueError(
             f"{name}: actions lie outside of their bounds: dimension {which} reaches from {float(least[which]):.4g} to "
-            f"{float(most[which]):.4g}, but [{float(low[which]):.4g}, {float(high[which]):.4g}] is allowed. If they are "
-            "in other units, rescale them; if the environment clamps them, clamp them alike."
+            f"{float(most[which]):.4g}, but [{float(low[which]):.4g}, {float(high[which]):.4g}] is allowed. If they "
+            "are in other units, rescale them; if the environment clamps them, clamp them alike."
         )

@@ -185,7 +185,8 @@ class TaggedReplayBuffer:
 
     def _add(self, tagged: list[tuple[TensorDictBase, Tag]], name: str) -> Tensor:
         """Check and encode all episodes, and store them when nothing can go wrong any more."""
-        ready, said = [], []
+        ready: list[tuple[TensorDictBase, Tag]] = []
+        said: list[str] = []
         form, whose = self._form, "the rows of the buffer have"
         for episode, tag in tagged:
             episode = self._checked(episode, name, said)
@@ -460,7 +461,7 @@ class TaggedReplayBuffer:
         self._after_loading(content["encoded"])
 
     def dumps(self, path: str | Path) -> None:
-        """Write the whole content below the folder ``path``, in the place of an earlier one, which stays whole until then.
+        """Write the whole content below the folder ``path``; an earlier one stays whole until this one is.
 
         Raises:
             ValueError: for the folder that the buffer itself works in.

@@ -26,7 +26,7 @@ def canonical(
     name: str,
     said: list[str],
 ) -> TensorDictBase:
-    """Whole episodes as they are stored: float32 actions and rewards, bool labels, observations that follow one another.
+    """Whole episodes as they are stored: float32 actions and rewards, bool labels, observations that follow on.
 
     Args:
         episodes: ``[*B, T]``.
@@ -136,9 +136,7 @@ def require_alike(mine: dict[NestedKey, Form], others: dict[NestedKey, Form], na
             )
     differing = sorted(map(str, mine.keys() ^ others.keys()))
     if differing:
-        raise ValueError(
-            f"{name}: the entries {', '.join(differing)} are not in all, as {whose} shows. Give all or none."
-        )
+        raise ValueError(f"{name}: the entries {', '.join(differing)} are not in all episodes. Give all or none.")
 
 
 def _show(key: NestedKey) -> str:
@@ -224,9 +222,9 @@ def _check_image(value: Tensor, episodes: TensorDictBase, what: str) -> None:
     low, high = float(value.min()), float(value.max())
     remedy = (
         "Convert them by (255 * images).round().to(torch.uint8)."
-        if 0.0 <= low and high <= 1.0 and value.is_floating_point()
+        if low >= 0.0 and high <= 1.0 and value.is_floating_point()
         else "Convert them by images.round().to(torch.uint8)."
-        if 0.0 <= low and high <= 255.0
+        if low >= 0.0 and high <= 255.0
         else "Bring them back to 0..255 and convert them by to(torch.uint8)."
     )
     raise TypeError(
@@ -240,10 +238,8 @@ def _require_following(before: Tensor, after: Tensor, dim: int, keys: EpisodeKey
     follows, follow = before.narrow(dim, 1, steps - 1), after.narrow(dim, 0, steps - 1)
     if torch.equal(follows, follow):
         return
-    if follows.is_floating_point():  # the same numbers, rounded on different ways, are meant alike
-        same = torch.isclose(follows, follow, rtol=1e-5, atol=1e-6)
-    else:
-        same = follows == follow
+    floats = follows.is_floating_point()  # the same numbers, rounded on different ways, are meant alike
+    same = torch.isclose(follows, follow, rtol=1e-5, atol=1e-6) if floats else follows == follow
     jumps = (~same.flatten(dim + 1).all(-1)).nonzero()
     if len(jumps) == 0:
         return
@@ -251,14 +247,14 @@ def _require_following(before: Tensor, after: Tensor, dim: int, keys: EpisodeKey
     where = f" of episode {episode[0]}" if episode else ""
     raise ValueError(
         f"{name}: the observation after step {step}{where} ({keys.next_observation}) is not the one before step "
-        f"{step + 1} ({_show(keys.observation)}); so it is at {len(jumps)} of {same.flatten(dim + 1)[..., 0].numel()} steps. "
-        "Steps of an episode follow one another, and only one of the two is kept. If an episode ends there (a reset "
-        "within a row), split the rows; if noise was added, add the same to both."
+        f"{step + 1} ({_show(keys.observation)}); so it is at {len(jumps)} of {same.flatten(dim + 1)[..., 0].numel()} "
+        "steps. Steps of an episode follow one another, and only one of the two is kept. If an episode ends there (a "
+        "reset within a row), split the rows; if noise was added, add the same to both."
     )
 
 
 def _check_reward(reward: Tensor, success: Tensor, keys: EpisodeKeys, name: str, said: list[str]) -> None:
-    """Rewards of LS³ are −1 outside the goal and 0 in it: with 1 in it and 0 outside, every state counts as the goal."""
+    """Rewards of LS³ are −1 outside the goal and 0 in it: where they are 0 outside, every state counts as the goal."""
     if success.any():
         if torch.equal(reward, success.to(reward.dtype)):
             raise ValueError(

@@ -13,7 +13,7 @@ from torchrl.data import TensorSpec
 
 from ls3_torchrl.data.arrays import keys_of, read_arrays, require_file_names, write_arrays
 from ls3_torchrl.data.bounds import require_within
-from ls3_torchrl.data.canonical import canonical, forms, require_alike, require_tensor, say
+from ls3_torchrl.data.canonical import Form, canonical, forms, require_alike, require_tensor, say
 from ls3_torchrl.data.episodes import Episodes, require_single
 from ls3_torchrl.data.keys import EpisodeKeys
 from ls3_torchrl.data.tags import VALUE_TAGS, Tag
@@ -87,16 +87,18 @@ def check_datasets(
         >>> from torchrl.data import Bounded
         >>> from ls3_torchrl.data import episode_from_arrays
         >>> keys = EpisodeKeys(observation="state")
-        >>> violated, reached = torch.zeros(9), torch.arange(9) == 8
-        >>> episode = episode_from_arrays(torch.zeros(10, 4), torch.zeros(9, 2), reached - 1.0, violated, reached, keys=keys)
+        >>> violated, reached = torch.zeros(9), (torch.arange(9) == 8).float()
+        >>> arrays = torch.zeros(10, 4), torch.zeros(9, 2), reached - 1, violated, reached
+        >>> episode = episode_from_arrays(*arrays, keys=keys)
         >>> check_datasets({Tag.SUCCESS: [episode]}, action_spec=Bounded(-1, 1, (2,)), keys=keys)
         >>> check_datasets({Tag.SUCCESS: [episode]}, action_spec=Bounded(-1, 1, (3,)), keys=keys)
         Traceback (most recent call last):
             ...
         ValueError: success: actions have 2 dimensions, but those of the action spec 3. Use data of the same actions.
     """
-    keys, said = keys or EpisodeKeys(), []
-    first: tuple[str, dict] | None = None
+    keys = keys or EpisodeKeys()
+    said: list[str] = []
+    first: tuple[str, dict[NestedKey, Form]] | None = None
     sets = {Tag.parse(tag): episodes for tag, episodes in datasets.items()}
     outcomes: dict[Tag, Tensor] = {}
     for tag, episodes in sets.items():
@@ -217,7 +219,8 @@ def save_episodes(
         OSError: on a full disk; names the file, and nothing is left.
         Further, and warns: as :func:`check_episodes`; what was converted is saved as it was converted.
     """
-    folder, keys, said = Path(folder), keys or EpisodeKeys(), []
+    folder, keys = Path(folder), keys or EpisodeKeys()
+    said: list[str] = []
     if folder.exists():
         raise FileExistsError(f"{folder} exists already. Choose another folder, or remove it first.")
     if not isinstance(datasets, Mapping) or not datasets:
@@ -337,7 +340,8 @@ def load_episodes(
         ValueError: for a file that is damaged, names it; for another format, version or domain; or as
             :func:`check_episodes`.
     """
-    folder, keys, said = Path(folder), keys or EpisodeKeys(), []
+    folder, keys = Path(folder), keys or EpisodeKeys()
+    said: list[str] = []
     lengths, version = _describe(folder, task)
     datasets: dict[Tag, TensorDictBase] = {}
     for name, steps in lengths.items():

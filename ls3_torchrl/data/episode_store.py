@@ -67,6 +67,11 @@ class EpisodeStore:
         require_at_least(room, 2, "frame_capacity")
         folders = [None if scratch_dir is None else Path(scratch_dir) / name for name in ("frames", "transitions")]
         self.scratch_dir = None if scratch_dir is None else Path(scratch_dir)
+        if self.scratch_dir is not None and (self.scratch_dir / _DESCRIPTION).exists():
+            raise FileExistsError(
+                f"The scratch_dir {scratch_dir} holds a saved buffer, which is not a replay buffer's to remove. Choose "
+                "another folder; loads() goes on with what was saved."
+            )
         self.frames = RowStore(room, folder=folders[0], device=device)
         self.transitions = RowStore(capacity, folder=folders[1], device=device)
         self._frames_written = 0

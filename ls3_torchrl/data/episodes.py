@@ -92,7 +92,7 @@ def episode_from_arrays(
 
 
 def _images(images: Tensor, said: list[str]) -> Tensor:
-    """Images as bytes with their channels first, where there is no doubt which values and which dimensions are meant."""
+    """Images as bytes with their channels first, where there is no doubt what is meant."""
     if list(images.shape[1:3]) == [64, 64] and images.shape[3] != 64:
         said.append(f"The images {list(images.shape)} have their channels last, and were given them first.")
         images = images.movedim(-1, 1).contiguous()

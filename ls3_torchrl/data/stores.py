@@ -74,7 +74,7 @@ class RowStore(TensorDictReplayBuffer):
         return self.writer.state_dict()["_cursor"]
 
     def prepare(self, rows: TensorDictBase) -> None:
-        """Make the room on disk for rows like these ``[n]``, where it is not there: what can fail fails before a write."""
+        """Make the room on disk for rows like these ``[n]``: what can fail fails before a write."""
         if self._folder is None or self.storage.initialized or len(rows) == 0:
             return
         _clear(self._folder, _is_scratch)
@@ -82,7 +82,8 @@ class RowStore(TensorDictReplayBuffer):
         note = "A replay buffer's memory while it is in use; it can be removed.\n"
         (self._folder / _SCRATCH).write_text(note, encoding="utf-8")
         with torch.inference_mode(False), torch.no_grad():
-            self.storage._init(rows.detach()[0])
+            one = rows[:1].detach().copy().set("index", torch.zeros(1, dtype=torch.int64))
+            self.storage._init(one[0])
 
     def extend(self, rows: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Write rows ``[n]``; returns where, int64 ``[n]``."""
