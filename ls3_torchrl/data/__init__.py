@@ -3,7 +3,7 @@
 from ls3_torchrl._checks import DataWarning
 from ls3_torchrl.data.augment import random_perspective, random_resized_crop
 from ls3_torchrl.data.buffer import TaggedReplayBuffer
-from ls3_torchrl.data.dataset import check_episodes, load_episodes, save_episodes
+from ls3_torchrl.data.dataset import check_datasets, check_episodes, load_episodes, save_episodes
 from ls3_torchrl.data.episodes import episode_from_arrays, split_episodes
 from ls3_torchrl.data.keys import EpisodeKeys
 from ls3_torchrl.data.labels import (
@@ -28,6 +28,7 @@ __all__ = [
     "TagSampler",
     "TaggedReplayBuffer",
     "after_violation",
+    "check_datasets",
     "check_episodes",
     "episode_from_arrays",
     "failure_tail",

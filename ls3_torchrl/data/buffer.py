@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer
 
-from ls3_torchrl._checks import require_at_least, require_finite, require_keys
+from ls3_torchrl._checks import require_at_least
+from ls3_torchrl.data.canonical import Form, canonical, forms, require_alike, say
 from ls3_torchrl.data.encoding import encode_frames
 from ls3_torchrl.data.episode_store import EpisodeStore
 from ls3_torchrl.data.episodes import Episodes, done_steps, split_episodes
-from ls3_torchrl.data.keys import EpisodeKeys
+from ls3_torchrl.data.keys import EpisodeKeys, as_tuple
 from ls3_torchrl.data.labels import length_without_idle_end
-from ls3_torchrl.data.rows import episode_rows, require_free, tag_of
+from ls3_torchrl.data.rows import NOT_STORED, OWN_KEYS, episode_rows, require_free, tag_of
 from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.selection import RowSelection
 from ls3_torchrl.data.stores import RowStore
@@ -111,6 +112,7 @@ class TaggedReplayBuffer:
         self._views: dict[RowSelection, TensorDictReplayBuffer] = {}
         self._encoder: TensorDictModuleBase | None = None
         self._encoded = False
+        self._form: dict[NestedKey, Form] | None = None  # of the entries of the episodes that were added
 
     def __len__(self) -> int:
         return len(self.transitions)
@@ -150,7 +152,10 @@ class TaggedReplayBuffer:
             tag: where they come from.
         """
         tag = Tag.parse(tag)
-        self._add([(episode, tag) for episode in split_episodes(episodes)])
+        split = split_episodes(episodes)
+        if not split:
+            raise ValueError(f"There is no episode to add as {tag.name.lower()!r}: got none. Collect some first.")
+        self._add([(episode, tag) for episode in split], "TaggedReplayBuffer.add")
 
     def extend(self, episodes: Episodes) -> Tensor:
         """Label and store whole episodes, as a collector hands them over.
@@ -176,34 +181,65 @@ class TaggedReplayBuffer:
                     "episodes: collect with Collector(..., trajs_per_batch=1), or let frames_per_batch be whole "
                     "episodes. Episodes that were cut off on purpose go in through add(episodes, tag)."
                 )
-        return self._add(tagged)
+        return self._add(tagged, "TaggedReplayBuffer.extend")
 
-    def _add(self, tagged: list[tuple[TensorDictBase, Tag]]) -> Tensor:
-        for episode, _ in tagged:
-            require_keys(episode, (*self.keys.required, *self.extra_keys), "TaggedReplayBuffer.add")
-        indices = [self._add_one(episode, tag) for episode, tag in tagged]
+    def _add(self, tagged: list[tuple[TensorDictBase, Tag]], name: str) -> Tensor:
+        """Check and encode all episodes, and store them when nothing can go wrong any more."""
+        ready: list[tuple[TensorDictBase, Tag]] = []
+        said: list[str] = []
+        form, whose = self._form, "the rows of the buffer have"
+        for episode, tag in tagged:
+            episode = self._checked(episode, name, said)
+            mine = forms(episode, (*self.keys.required, *self.extra_keys))
+            if form is None:
+                form, whose = mine, "another episode of the call has"
+            require_alike(mine, form, name, whose)
+            self._store.require_room(len(episode))
+            ready.append((episode, tag))
+        posteriors = [self._posteriors_of_new(self._frames_of(episode)) for episode, _ in ready]
+        rows = [self._rows_of(*each, latents) for each, latents in zip(ready, posteriors, strict=True)]
+        indices = []
+        for (episode, _), row in zip(ready, rows, strict=True):
+            frames = TensorDict({}, [len(row) + 1]).set(self.keys.observation, self._frames_of(episode))
+            indices.append(self._store.write(frames, row))
+        self._form = form
         for view in self._views.values():
             view.sampler.refresh()
+        say(said, stacklevel=3)
         return torch.cat(indices) if indices else torch.zeros(0, dtype=torch.long)
 
-    def _add_one(self, episode: TensorDictBase, tag: Tag) -> Tensor:
+    def _stored_form(self) -> dict[NestedKey, Form] | None:
+        """Shapes and types of an episode's entries, of the rows that there are."""
+        if not len(self):
+            return None
         keys = self.keys
+        form = forms(self.transitions.storage[:1], self._kept)
+        frame = forms(self.frames.storage[:1], [keys.observation])[keys.observation]
+        return {**form, keys.observation: frame, keys.next_observation: frame}
+
+    def _checked(self, episode: TensorDictBase, name: str, said: list[str]) -> TensorDictBase:
+        """What is kept of an episode, in the form in which it is stored."""
+        keys = self.keys
+        episode = canonical(episode, keys, extra_keys=self.extra_keys, images=False, name=name, said=said)
+        episode = episode.select(*keys.required, *self.extra_keys).detach()
         if self.success_tail is not None:
             episode = episode[: length_without_idle_end(episode.get(keys.success), self.success_tail)]
-        self._store.require_room(len(episode))
-        require_finite(episode.get(keys.action), "The episode's action")
-        require_finite(episode.get(keys.reward), "The episode's reward")
-        frames = torch.cat([episode.get(keys.observation), episode.get(keys.next_observation)[-1:]])
-        rows = episode_rows(
+        return episode
+
+    def _frames_of(self, episode: TensorDictBase) -> Tensor:
+        keys = self.keys
+        return torch.cat([episode.get(keys.observation), episode.get(keys.next_observation)[-1:]])
+
+    def _rows_of(self, episode: TensorDictBase, tag: Tag, posteriors: TensorDictBase) -> TensorDict:
+        return episode_rows(
             episode,
-            self._posteriors_of_new(frames),  # before anything is written: the encoder may fail
+            posteriors,
             tag,
-            keys=keys,
+            keys=self.keys,
             extra_keys=self.extra_keys,
             gamma=self.gamma,
             continue_failures=self.continue_failures,
         )
-        return self._store.write(TensorDict({}, [len(frames)]).set(keys.observation, frames), rows)
 
     def _posteriors_of_new(self, frames: Tensor) -> TensorDict:
         if self._encoder is not None:
@@ -370,13 +406,35 @@ class TaggedReplayBuffer:
             )
         )
 
-    def _require_settings(self, settings: dict[str, Any]) -> None:
-        for name, own in self._settings().items():
-            if settings[name] != own:
+    def _require_settings(self, content: Any, name: str) -> None:
+        settings = content.get("settings") if isinstance(content, Mapping) else None
+        if not isinstance(settings, Mapping) or type(content.get("encoded")) is not bool:
+            raise ValueError(
+                f"{name} is no saved buffer: it lacks its settings. Save one with dumps() or state_dict()."
+            )
+        for key, own in self._settings().items():
+            if settings.get(key) != own:
                 raise ValueError(
-                    f"The content was saved by a buffer with {name}={settings[name]!r}, but this one has {own!r}. "
+                    f"{name} was saved by a buffer with {key}={settings.get(key)!r}, but this one has {own!r}. "
                     "Make the buffer with the settings of the saved one."
                 )
+
+    def _require_rows(self, store: Any, name: str) -> None:
+        """Raise ``ValueError`` when rows or frames of a saved store lack an entry."""
+        needed = {"frames": [self.keys.observation], "transitions": [*OWN_KEYS - NOT_STORED, *self._kept]}
+        for ring, keys in needed.items():
+            rows = store.get(ring, {}).get("rows") if isinstance(store, Mapping) else None
+            for key in keys if rows else ():
+                value = rows
+                for part in as_tuple(key):
+                    value = value.get(part) if isinstance(value, Mapping) else None
+                if value is None:
+                    raise ValueError(f"{name} is damaged: its {ring} lack {key!r}. Save the buffer again.")
+
+    @property
+    def _kept(self) -> tuple[NestedKey, ...]:
+        keys = self.keys
+        return (keys.action, keys.reward, keys.constraint, keys.success, *self.extra_keys)
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of the whole content, which ``torch.load(weights_only=True)`` can read.
@@ -392,32 +450,38 @@ class TaggedReplayBuffer:
         :meth:`encode` before, while the buffer is empty, and nothing is encoded again.
 
         Raises:
-            ValueError: when the settings differ.
+            ValueError: when the settings differ, or for what is no buffer's state; the buffer stays as it was.
         """
-        self._require_settings(state_dict["settings"])
-        self._store.load_state_dict(state_dict["store"])
-        self._after_loading(state_dict["encoded"])
+        self._take(state_dict, "The content")
+
+    def _take(self, content: Any, name: str) -> None:
+        self._require_settings(content, name)
+        self._require_rows(content.get("store"), name)
+        self._store.load_state_dict(content.get("store"), name)
+        self._after_loading(content["encoded"])
 
     def dumps(self, path: str | Path) -> None:
-        """Write the whole content below the folder ``path``, over an earlier one.
+        """Write the whole content below the folder ``path``; an earlier one stays whole until this one is.
 
         Raises:
             ValueError: for the folder that the buffer itself works in.
-            FileExistsError: for a folder with other files.
+            FileExistsError: for a folder with something else of the same name.
+            OSError: on a full disk; names the file.
         """
         self._store.dumps(path, {"settings": self._settings(), "encoded": self._encoded})
 
     def loads(self, path: str | Path) -> None:
-        """Take over what :meth:`dumps` has written, as :meth:`load_state_dict` does. No pickles are read.
+        """Take over what :meth:`dumps` has written, as :meth:`load_state_dict` does.
+
+        Every file's size and checksum are verified first. No pickles are read, and nothing is written to the folder.
 
         Raises:
-            FileNotFoundError: when the folder holds no whole buffer.
-            ValueError: when the settings differ.
+            FileNotFoundError: when the folder holds no whole buffer, or lacks a file.
+            ValueError: when the settings differ, or a file is damaged, which is named; the buffer stays as it was.
         """
         description = EpisodeStore.description(path)
-        self._require_settings(description["settings"])
-        self._store.loads(path)
-        self._after_loading(description["encoded"])
+        self._require_settings(description, f"The content of {path}")
+        self._take({**description, "store": self._store.read(path)}, f"The content of {path}")
 
     # The names that torchrl.checkpoint.Checkpoint looks for.
     dump, load = dumps, loads
@@ -426,5 +490,6 @@ class TaggedReplayBuffer:
         self._encoded = encoded
         if not encoded:
             self._encoder = None  # its latents are not those of the rows
+        self._form = self._stored_form()
         for view in self._views.values():
             view.sampler.refresh()

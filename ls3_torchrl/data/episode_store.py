@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import json
+import shutil
+import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,22 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from ls3_torchrl._checks import require_at_least
-from ls3_torchrl.data.stores import RowStore
-from ls3_torchrl.files import save_json_atomically
+from ls3_torchrl.data.stores import RowStore, is_dump
+from ls3_torchrl.files import (
+    PARTIAL,
+    checksum_of,
+    file_manifest,
+    inner_path,
+    new_folder,
+    read_json,
+    save_json_atomically,
+    verify_files,
+)
 
 _DESCRIPTION = "buffer.json"
+VERSION = 2
+_CONTENT = "content-"
+_REMEDY = "Restore the folder from a copy, or save the buffer again with dumps()."
 
 
 class EpisodeStore:
@@ -54,6 +67,11 @@ class EpisodeStore:
         require_at_least(room, 2, "frame_capacity")
         folders = [None if scratch_dir is None else Path(scratch_dir) / name for name in ("frames", "transitions")]
         self.scratch_dir = None if scratch_dir is None else Path(scratch_dir)
+        if self.scratch_dir is not None and (self.scratch_dir / _DESCRIPTION).exists():
+            raise FileExistsError(
+                f"The scratch_dir {scratch_dir} holds a saved buffer, which is not a replay buffer's to remove. Choose "
+                "another folder; loads() goes on with what was saved."
+            )
         self.frames = RowStore(room, folder=folders[0], device=device)
         self.transitions = RowStore(capacity, folder=folders[1], device=device)
         self._frames_written = 0
@@ -78,6 +96,7 @@ class EpisodeStore:
         steps = len(rows)
         self._make_room(steps)
         rows.set("frame", self._frames_written + torch.arange(steps).unsqueeze(-1))
+        self.transitions.prepare(rows)  # before frames are written that nothing would belong to
         self.frames.extend(frames)
         self._frames_written += steps + 1
         return self.transitions.extend(rows)
@@ -115,27 +134,60 @@ class EpisodeStore:
         rings = {"frames": self.frames.state_dict(), "transitions": self.transitions.state_dict()}
         return {**rings, "counters": self._counters()}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over both rings and the counters."""
-        self.frames.load_state_dict(state_dict["frames"])
-        self.transitions.load_state_dict(state_dict["transitions"])
-        self._set_counters(state_dict["counters"])
+    def load_state_dict(self, state_dict: Mapping[str, Any], name: str = "The state") -> None:
+        """Take over both rings and the counters.
+
+        Raises:
+            ValueError: for what is no store's state, or damaged; ``name`` says what, and the store stays as it was.
+        """
+        if not isinstance(state_dict, Mapping) or not {"frames", "transitions", "counters"} <= set(state_dict):
+            raise ValueError(f"{name} is no replay buffer's: it lacks frames, transitions or counters.")
+        frames = self.frames.checked(state_dict["frames"], f"{name}, frames,")
+        transitions = self.transitions.checked(state_dict["transitions"], f"{name}, transitions,")
+        counters = state_dict["counters"]
+        written = counters.get("frames_written") if isinstance(counters, Mapping) else None
+        if type(written) is not int or type(counters.get("shift")) is not int or written < frames[1]["count"]:
+            raise ValueError(f"{name} is damaged: its counters are {counters!r}. {_REMEDY}")
+        if transitions[0] is not None:
+            number = transitions[0].get("frame", None)
+            if number is None or number.shape != (len(transitions[0]), 1) or number.dtype != torch.int64:
+                raise ValueError(f"{name} is damaged: its transitions do not tell their frames. {_REMEDY}")
+            if int(number.min()) < 0 or int(number.max()) + 1 >= written:
+                raise ValueError(f"{name} is damaged: its transitions tell of frames that there are not. {_REMEDY}")
+        self.frames.restore(*frames)
+        self.transitions.restore(*transitions)
+        self._frames_written, self._shift = counters["frames_written"], counters["shift"]
 
     def dumps(self, path: str | Path, description: dict[str, Any]) -> None:
-        """Write both rings, the counters and a description below the folder ``path``, over earlier ones.
+        """Write both rings, the counters and a description below the folder ``path``, in the place of earlier ones.
+
+        The description is written last and names the folder that holds the rest, with the size and checksum of every
+        file: where writing is cut off, what was there before is whole.
 
         Raises:
             ValueError: for the ``scratch_dir``.
-            FileExistsError: where other files lie in the way.
+            FileExistsError: for a folder with a ``buffer.json`` of something else.
+            OSError: on a full disk; names the file, and what was there before is whole.
         """
         path = Path(path)
         if self.scratch_dir is not None and path.resolve() == self.scratch_dir.resolve():
             raise ValueError(f"{path} is the buffer's scratch_dir. Choose another folder to save to.")
-        (path / _DESCRIPTION).unlink(missing_ok=True)
-        self.frames.dumps(path / "frames")
-        self.transitions.dumps(path / "transitions")
-        # Last: a folder with it is whole.
-        save_json_atomically({**description, "counters": self._counters()}, path / _DESCRIPTION)
+        _require_ours(path / _DESCRIPTION)
+        content = f"{_CONTENT}{uuid.uuid4().hex[:12]}"
+        with new_folder(path / content) as folder:
+            self.frames.dumps(folder / "frames")
+            self.transitions.dumps(folder / "transitions")
+        about = {
+            **description,
+            "counters": self._counters(),
+            "version": VERSION,
+            "content": content,
+            "files": file_manifest(path / content),
+        }
+        save_json_atomically(
+            {**about, "checksum": checksum_of(about)}, path / _DESCRIPTION
+        )  # a folder with it is whole
+        _remove_earlier(path, content)
 
     @staticmethod
     def description(path: str | Path) -> dict[str, Any]:
@@ -143,21 +195,58 @@ class EpisodeStore:
 
         Raises:
             FileNotFoundError: when the folder holds no whole store.
+            ValueError: when the description is damaged.
         """
         file = Path(path) / _DESCRIPTION
         if not file.is_file():
             raise FileNotFoundError(f"{path} holds no saved buffer: {_DESCRIPTION} is missing. Save one with dumps().")
-        return json.loads(file.read_text())
+        about = read_json(file, remedy=_REMEDY)
+        version = about.get("version", 1)
+        if version not in (1, VERSION):
+            raise ValueError(f"{file} is of version {version!r}, but 1 and {VERSION} are read. {_REMEDY}")
+        if version == 1 and {"content", "files", "checksum"} & set(about):
+            raise ValueError(f"{file} is damaged: it has entries that its version 1 has not. {_REMEDY}")
+        if version == VERSION and about.pop("checksum", None) != checksum_of(about):
+            raise ValueError(f"{file} is damaged, or was edited: its checksum is another. {_REMEDY}")
+        return about
+
+    def read(self, path: str | Path) -> dict[str, Any]:
+        """What :meth:`dumps` has written, checked and as :meth:`state_dict` gives it. Nothing is run, nothing written.
+
+        Raises:
+            FileNotFoundError, ValueError: for missing or damaged files, which are named.
+        """
+        path, about = Path(path), self.description(path)
+        folder = path
+        if "files" in about:
+            folder = inner_path(path, about.get("content"))
+            verify_files(folder, about["files"], remedy=_REMEDY)
+        rings = {name: RowStore.read(folder / name, remedy=_REMEDY) for name in ("frames", "transitions")}
+        return {**rings, "counters": about.get("counters")}
 
     def loads(self, path: str | Path) -> None:
-        """Take over both rings and the counters."""
-        counters = self.description(path)["counters"]
-        self.frames.loads(Path(path) / "frames")
-        self.transitions.loads(Path(path) / "transitions")
-        self._set_counters(counters)
+        """Take over what :meth:`dumps` has written."""
+        self.load_state_dict(self.read(path), str(path))
 
     def _counters(self) -> dict[str, int]:
         return {"frames_written": self._frames_written, "shift": self._shift}
 
-    def _set_counters(self, counters: Mapping[str, int]) -> None:
-        self._frames_written, self._shift = counters["frames_written"], counters["shift"]
+
+def _require_ours(file: Path) -> None:
+    """Raise ``FileExistsError`` when a description is there that no buffer wrote; a damaged one may be replaced."""
+    try:
+        ours = not file.exists() or "counters" in read_json(file)
+    except ValueError:
+        ours = True
+    if not ours:
+        raise FileExistsError(f"{file} is not a replay buffer's to replace. Choose another folder, or empty it first.")
+
+
+def _remove_earlier(path: Path, content: str) -> None:
+    """Remove what earlier saves have left, whole or not."""
+    for child in path.iterdir():
+        old = child.name.startswith(_CONTENT) and (child / "frames").is_dir() and child.name != content
+        cut = child.name.startswith(_CONTENT) and child.name.endswith(PARTIAL)
+        first = child.name in ("frames", "transitions") and (child / "meta.json").is_file() and is_dump(child)
+        if child.is_dir() and (old or cut or first):
+            shutil.rmtree(child, ignore_errors=True)

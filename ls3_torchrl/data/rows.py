@@ -19,6 +19,8 @@ OWN_KEYS: frozenset[NestedKey] = frozenset(
         *("loc", "scale", "latent", ("next", "loc"), ("next", "scale"), ("next", "latent")),
     ]
 )
+#: Those of them that are made when rows are drawn.
+NOT_STORED: frozenset[NestedKey] = frozenset(["index", "latent", ("next", "latent")])
 
 
 def require_free(keys: Iterable[NestedKey]) -> None:

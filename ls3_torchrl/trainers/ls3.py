@@ -20,6 +20,7 @@ from ls3_torchrl.objectives import (
     SafeSetLoss,
     TD1ValueLoss,
 )
+from ls3_torchrl.trainers.checks import require_fitting_actions, warn_of_missing_outcomes
 from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner, wants_bf16
 from ls3_torchrl.trainers.options import LS3Options
 
@@ -41,7 +42,7 @@ class LS3Trainer:
         progress: show progress bars.
 
     Raises:
-        ValueError: for options that do not fit the buffer's.
+        ValueError: for options that do not fit the buffer's; in :meth:`train_offline`, for actions that do not fit.
         FloatingPointError: by training, when a loss is not finite.
 
     Example:
@@ -52,7 +53,8 @@ class LS3Trainer:
         >>> agent = LS3Agent(action_dim=2, encoder=encoder, latent_dim=4)
         >>> step = {"reward": -torch.ones(9, 1), "pixels": torch.randn(9, 4)}
         >>> step |= {k: torch.ones(9, 1, dtype=torch.bool) for k in ("constraint", "success")}
-        >>> episode = TensorDict({"pixels": torch.randn(9, 4), "action": torch.zeros(9, 2), "next": step}, [9])
+        >>> before = torch.cat([torch.randn(1, 4), step["pixels"][:-1]])
+        >>> episode = TensorDict({"pixels": before, "action": torch.zeros(9, 2), "next": step}, [9])
         >>> buffer = TaggedReplayBuffer(capacity=100, latent_dim=4)
         >>> buffer.add(episode, "success")
         >>> buffer.encode(agent.encoder)
@@ -216,7 +218,16 @@ class LS3Trainer:
         return rows
 
     def train_offline(self) -> None:
-        """Train the latent models on the offline data (equations (2), (3), (4), (5) and the classifiers)."""
+        """Train the latent models on the offline data (equations (2), (3), (4), (5) and the classifiers).
+
+        Raises:
+            ValueError: when the buffer's actions are not the agent's: of another size, or outside of its bounds.
+
+        Warns:
+            DataWarning: when no episode that values are learnt from ever succeeds, or no violating one violates.
+        """
+        require_fitting_actions(self.agent, self.buffer)
+        warn_of_missing_outcomes(self.buffer, stacklevel=2)
         steps = self.options.offline
         self._failure_value = None
         self.dynamics.train(steps.dynamics_steps, "Dynamics")

@@ -15,6 +15,7 @@ from torchrl.record.loggers import Logger
 from ls3_torchrl.agent import LS3Agent
 from ls3_torchrl.data import TaggedReplayBuffer, random_perspective, random_resized_crop
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
+from ls3_torchrl.trainers.checks import require_fitting_actions
 from ls3_torchrl.trainers.learner import LOG_INTERVAL, log_scalars, threads, wants_bf16
 from ls3_torchrl.trainers.options import VAEOptions
 from ls3_torchrl.trainers.progress import progress_bar
@@ -108,7 +109,12 @@ class VAETrainer:
         self._bf16 = wants_bf16(options.autocast, self.device)
 
     def train(self) -> None:
-        """Train what is left of the steps, or take the checkpoint's encoder and decoder; freeze both, encode."""
+        """Train what is left of the steps, or take the checkpoint's encoder and decoder; freeze both, encode.
+
+        Raises:
+            ValueError: when the buffer's actions are not the agent's, which must learn from them afterwards.
+        """
+        require_fitting_actions(self.agent, self.buffer)
         if self.options.checkpoint is not None:
             self._take_checkpoint(self.options.checkpoint)
             return

@@ -361,13 +361,13 @@ def test_pixel_transitions_whose_images_are_gone_are_refused():
         buffer.sample_frame_transitions(200)
 
 
-@pytest.mark.parametrize(("key", "what"), [("action", "action"), (("next", "reward"), "reward")])
+@pytest.mark.parametrize(("key", "what"), [("action", "action"), (("next", "reward"), r"\('next', 'reward'\)")])
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
 def test_numbers_that_are_not_finite_never_get_in(key, what, bad):
     episode = Camera().shoot(3)
     episode[key][1, 0] = bad
     buffer = TaggedReplayBuffer(20, latent_dim=D)
-    with pytest.raises(ValueError, match=f"episode's {what} is not finite: 1 of"):
+    with pytest.raises(ValueError, match=f"add: {what} is not finite: 1 of"):
         buffer.add(episode, "success")
     assert len(buffer) == len(buffer.frames) == 0
 
@@ -457,11 +457,8 @@ def test_a_scratch_folder_never_costs_what_was_saved(tmp_path):
     buffer = TaggedReplayBuffer(20, latent_dim=D)
     buffer.add(camera.shoot(3), "success")
     buffer.dumps(tmp_path / "saved")
-    other = TaggedReplayBuffer(20, latent_dim=D, scratch_dir=tmp_path / "saved")
     with pytest.raises(FileExistsError, match="not a replay buffer's to remove"):
-        other.add(camera.shoot(2), "success")
-    with pytest.raises(FileExistsError):
-        other.loads(tmp_path / "saved")
+        TaggedReplayBuffer(20, latent_dim=D, scratch_dir=tmp_path / "saved")
     again = TaggedReplayBuffer(20, latent_dim=D)
     again.loads(tmp_path / "saved")
     assert len(again) == 3

@@ -106,7 +106,7 @@ def test_a_foreign_encoder_with_a_spread_is_drawn_from():
 def test_an_encoder_on_pixels_under_another_key():
     keys = EpisodeKeys(observation=("camera", "top"))
     frames = np.random.default_rng(0).integers(0, 256, (4, 3, 64, 64), dtype=np.uint8)
-    data = episode_from_arrays(frames, np.zeros((3, 1)), np.zeros(3), np.zeros(3), np.zeros(3), keys=keys)
+    data = episode_from_arrays(frames, np.zeros((3, 1)), -np.ones(3), np.zeros(3), np.zeros(3), keys=keys)
     encoder = PixelEncoder(latent_dim=4, pixels_key=("camera", "top"))
     buffer = TaggedReplayBuffer(10, latent_dim=4, keys=keys)
     buffer.add(data, "success")

@@ -25,8 +25,8 @@ def filled(episode):
 
     def make(agent, **options):
         buffer = TaggedReplayBuffer(100, latent_dim=8, **options)
-        for tag in ("success", "constraint", "online"):
-            buffer.add(episode(actions=torch.randn(9, 2)), tag)
+        for tag, outcome in (("success", {"success": 8}), ("constraint", {"constraint": 8}), ("online", {})):
+            buffer.add(episode(actions=torch.randn(9, 2), **outcome), tag)
         buffer.encode(agent.encoder)
         return buffer
 
