@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from numbers import Integral, Real
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ls3_torchrl._checks import require_at_least, require_choice, require_positive, require_unit_interval
 
@@ -14,13 +16,43 @@ Autocast = bool | Literal["auto"]
 MEAN_LATENTS = ("dynamics", "constraint", "goal")
 
 
+def _require_count(value: int, low: int, name: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise TypeError(f"{name} must be a whole number of at least {low}, got {value!r}.")
+    require_at_least(int(value), low, name)
+
+
+def _require_number(value: float, name: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} must be a number, got {value!r}.")
+    if not math.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, got {value}.")
+
+
 def _require_not_negative(value: float, name: str) -> None:
+    _require_number(value, name)
     if not value >= 0.0:
         raise ValueError(f"{name} must not be negative, got {value}.")
 
 
+def _require_above_zero(value: float, name: str) -> None:
+    _require_number(value, name)
+    require_positive(value, name)
+
+
+def _require_fraction(value: float, name: str) -> None:
+    _require_number(value, name)
+    require_unit_interval(value, name)
+
+
+def _require_flags(options: Any, *names: str) -> None:
+    for name in names:
+        if not isinstance(getattr(options, name), bool):
+            raise TypeError(f"{name} must be true or false, got {getattr(options, name)!r}.")
+
+
 def _require_autocast(value: Autocast) -> None:
-    if value not in (True, False, "auto"):
+    if not (isinstance(value, bool) or value == "auto"):
         raise ValueError(f"autocast must be true, false or 'auto', got {value!r}.")
 
 
@@ -28,6 +60,10 @@ def _require_rising(value: Sequence[float] | None, name: str, meaning: str, low:
     """A pair within [0, 1] as a tuple; its first number lies above ``low`` or, for ``low`` below 0, may be 0."""
     if value is None:
         return None
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise TypeError(f"{name} must be null or {meaning}, got {value!r}.")
+    for bound in value:
+        _require_number(bound, name)
     pair = tuple(float(bound) for bound in value)
     if len(pair) != 2 or not low < pair[0] <= pair[1] <= 1.0 or (low < 0.0 and not 0.0 <= pair[0] < pair[1]):
         raise ValueError(f"{name} must be null or {meaning}, got {list(value)}.")
@@ -62,6 +98,7 @@ class VAEOptions:
 
     Raises:
         ValueError: naming the field, what was received and what is allowed.
+        TypeError: likewise, for a value of another type.
 
     Example:
         >>> VAEOptions(steps=2000, batch_size=64, lr=1e-3, schedule="onecycle").beta
@@ -85,16 +122,19 @@ class VAEOptions:
     threads: int | None = None
 
     def __post_init__(self) -> None:
+        if self.checkpoint is not None and not isinstance(self.checkpoint, str | Path):
+            raise TypeError(f"checkpoint must be null or the file of a trained agent, got {self.checkpoint!r}.")
         if self.checkpoint is not None and not Path(self.checkpoint).is_file():
             raise ValueError(
                 f"checkpoint must be null or the file of a trained agent; there is none at {self.checkpoint}."
             )
         for name in ("steps", "batch_size", "prediction_horizon"):
-            require_at_least(getattr(self, name), 1, name)
+            _require_count(getattr(self, name), 1, name)
         for name in ("enlarge_to", "threads"):
             if getattr(self, name) is not None:
-                require_at_least(getattr(self, name), 1, name)
-        require_positive(self.lr, "lr")
+                _require_count(getattr(self, name), 1, name)
+        _require_above_zero(self.lr, "lr")
+        _require_flags(self, "unit_scale")
         require_choice(self.schedule, ("constant", "onecycle"), "schedule")
         require_choice(self.reduction, ("mean", "sum"), "reduction")
         _require_not_negative(self.beta, "beta")
@@ -124,7 +164,7 @@ class OfflineOptions:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            require_at_least(value, 0, name)
+            _require_count(value, 0, name)
 
 
 @dataclass(frozen=True)
@@ -146,7 +186,8 @@ class OnlineOptions:
 
     def __post_init__(self) -> None:
         for name in ("dynamics_steps", "classifier_steps", "value_td_steps"):
-            require_at_least(getattr(self, name), 0, name)
+            _require_count(getattr(self, name), 0, name)
+        _require_number(self.fraction, "fraction")
         if not 0.0 <= self.fraction < 1.0:
             raise ValueError(f"fraction must lie in [0, 1), got {self.fraction}.")
 
@@ -175,11 +216,12 @@ class OptimOptions:
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "target_interval"):
-            require_at_least(getattr(self, name), 1, name)
+            _require_count(getattr(self, name), 1, name)
         for name in ("lr", "dynamics_lr"):
-            require_positive(getattr(self, name), name)
+            _require_above_zero(getattr(self, name), name)
         _require_autocast(self.autocast)
-        require_unit_interval(self.cooldown, "cooldown")
+        _require_fraction(self.cooldown, "cooldown")
+        _require_flags(self, "bootstrap")
 
 
 @dataclass(frozen=True)
@@ -213,11 +255,16 @@ class LossOptions:
     timed_out_weight: float = 1.0
 
     def __post_init__(self) -> None:
-        require_unit_interval(self.gamma_safe_set, "gamma_safe_set")
+        _require_fraction(self.gamma_safe_set, "gamma_safe_set")
+        _require_flags(self, "zero_at_goal", "monte_carlo")
         require_choice(self.failure_rows, ("all", "violating"), "failure_rows")
-        require_at_least(self.dynamics_horizon, 1, "dynamics_horizon")
+        _require_count(self.dynamics_horizon, 1, "dynamics_horizon")
+        if self.failure_value is not None:
+            _require_number(self.failure_value, "failure_value")
         for name in ("failure_weight", "timed_out_weight"):
             _require_not_negative(getattr(self, name), name)
+        if isinstance(self.mean_latents, str):
+            raise TypeError(f"mean_latents must be a list of names, got {self.mean_latents!r}.")
         unknown = sorted(set(self.mean_latents) - set(MEAN_LATENTS))
         if unknown:
             raise ValueError(f"mean_latents must be some of {', '.join(MEAN_LATENTS)}; got {', '.join(unknown)}.")

@@ -34,7 +34,7 @@ def split_arguments(arguments: Iterable[str]) -> tuple[list[str], list[str]]:
 
 def config_dir(options: Sequence[str]) -> str | None:
     """The folder of a user's own files."""
-    for option, value in zip(options, [*options[1:], ""], strict=True):
+    for option, value in zip(options, [*options, ""][1:], strict=True):
         name, equals, same = option.partition("=")
         if name in ("--config-dir", "-cd"):
             return same if equals else value

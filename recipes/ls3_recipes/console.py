@@ -2,13 +2,63 @@
 
 from __future__ import annotations
 
+import logging
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from ls3_torchrl._checks import DataWarning
+
 console = Console()
+
+
+@contextmanager
+def command_line(who: str) -> Iterator[None]:
+    """Inside, what is said reads well on a terminal.
+
+    What is said of data comes as a line instead of a Python warning; TorchRL tells nothing but warnings; characters
+    that the terminal lacks become question marks; and Ctrl-C ends with one line.
+
+    Args:
+        who: what lines begin with.
+
+    Raises:
+        SystemExit: with code 130, the shells' own, for Ctrl-C.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure") and (stream.encoding or "").lower().replace("-", "") != "utf8":
+            stream.reconfigure(errors="replace")
+    logger = logging.getLogger("torchrl")
+    level = logger.level
+    logger.setLevel(max(level, logging.WARNING))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", DataWarning)
+            warnings.showwarning = _show(who, warnings.showwarning)
+            yield
+    except KeyboardInterrupt:
+        print(f"{who}: stopped by Ctrl-C.", file=sys.stderr)
+        raise SystemExit(130) from None
+    finally:
+        logger.setLevel(level)
+
+
+def _show(who: str, other: Any) -> Any:
+    """What shows a warning: as a line where it is of data, as ever otherwise."""
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if issubclass(category, DataWarning):
+            print(f"{who}: {' '.join(str(message).split())}", file=sys.stderr)
+        else:
+            other(message, category, *where, **more)
+
+    return show
 
 
 def percent_of(figures: dict[str, Any]) -> tuple[str, str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 from pathlib import Path
 
 import torch
@@ -13,13 +14,19 @@ def choose_device(name: str) -> torch.device:
     """``auto`` takes CUDA where there is one; products of float32 matrices are TF32 there.
 
     Raises:
-        ValueError: when CUDA is asked for and there is none.
+        ValueError: for a device that is not there, or none that is known here.
     """
+    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,4})?", name):
+        raise ValueError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}.")
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise ValueError(
             f"device={name} was asked for, but PyTorch sees no CUDA device. Use device=cpu or device=auto."
+        )
+    if ":" in name and int(name.partition(":")[2]) >= torch.cuda.device_count():
+        raise ValueError(
+            f"device={name} was asked for, but PyTorch sees {torch.cuda.device_count()} CUDA devices, from cuda:0 on."
         )
     if name.startswith("cuda"):
         torch.set_float32_matmul_precision("high")
@@ -30,7 +37,8 @@ def hardware(device: torch.device) -> dict[str, str | int]:
     """What the run ran on."""
     name = platform.processor() or platform.machine()
     if Path("/proc/cpuinfo").is_file():
-        models = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        models = [line for line in lines if line.startswith("model name")]
         name = models[0].split(":", 1)[1].strip() if models else name
     gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else "none"
     return {"cpu": name, "cores": os.cpu_count() or 0, "threads": torch.get_num_threads(), "gpu": gpu}

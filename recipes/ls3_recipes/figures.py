@@ -5,13 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import LazyStackedTensorDict, TensorDictBase
 
 Figures = dict[str, torch.Tensor]
 
 
+def as_one_shape(episodes: TensorDictBase) -> TensorDictBase:
+    """Episodes ``[N, T]`` as they are, and those of different lengths as one of all their steps, ``[1, T_1 + …]``."""
+    if not isinstance(episodes, LazyStackedTensorDict) or len({len(row) for row in episodes.tensordicts}) == 1:
+        return episodes
+    return torch.cat([row.to_tensordict() for row in episodes.tensordicts])[None]
+
+
 def episode_figures(episodes: TensorDictBase) -> Figures:
-    """Return, success and violation of each episode of ``[N, T]``; each ``[N]``."""
+    """Return, success and violation of each episode of ``[N, T]``, or of different lengths; each ``[N]``."""
+    if as_one_shape(episodes) is not episodes:
+        each = [episode_figures(row[None]) for row in episodes.unbind(0)]
+        return {name: torch.cat([figures[name] for figures in each]) for name in each[0]}
     return {
         "return": episodes["next", "reward"].sum((-1, -2)),
         "success": episodes["next", "success"].any(-2).squeeze(-1),

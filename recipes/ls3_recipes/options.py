@@ -4,22 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeVar, get_type_hints
 
 from omegaconf import MISSING
 
+from ls3_recipes.typed import did_you_mean, typed
+
 S = TypeVar("S")
 
 
 def from_signatures(
-    name: str, doc: str, *sources: Callable[..., Any], only: Collection[str] = (), without: Collection[str] = ()
+    name: str,
+    doc: str,
+    *sources: Callable[..., Any],
+    only: Collection[str] = (),
+    without: Collection[str] = (),
+    types: Mapping[str, Any] | None = None,
+    check: Callable[..., object] | None = None,
 ) -> type:
     """A frozen dataclass whose fields are the arguments of functions, constructors or dataclasses.
 
-    Every option is defined, documented and checked where it is used; a configuration takes names and defaults from
-    there.
+    Every option is defined, documented and checked where it is used; a configuration takes names, types and defaults
+    from there.
 
     Args:
         name: of the dataclass.
@@ -27,6 +35,8 @@ def from_signatures(
         sources: whose arguments become fields; no two may have one name.
         only: the arguments that are taken; all keyword-only ones that are no tensordict key when empty.
         without: the arguments that are not taken, and all others are, instead of ``only``.
+        types: of fields that a configuration may also write otherwise than the sources take them.
+        check: called with all fields when an instance is made; raises ``ValueError`` for values out of range.
 
     Raises:
         ValueError: when two sources share a name, or one in ``only`` or ``without`` is no argument.
@@ -53,9 +63,21 @@ def from_signatures(
                 )
     if missing := {*only, *without} - named:
         raise ValueError(f"{name}: none of {sources} has an argument {', '.join(sorted(missing))}.")
-    made = dataclasses.make_dataclass(name, [(key, Any, value) for key, value in fields.items()], frozen=True)
+    hints = _hints(sources) | dict(types or {})
+    namespace = {} if check is None else {"__post_init__": lambda self: check(**vars(self))}
+    annotated = [(key, hints.get(key, Any), value) for key, value in fields.items()]
+    made = dataclasses.make_dataclass(name, annotated, frozen=True, namespace=namespace)
     made.__doc__ = doc
     return made
+
+
+def _hints(sources: Iterable[Callable[..., Any]]) -> dict[str, Any]:
+    """The annotations of callables' arguments, of dataclasses their fields'."""
+    out: dict[str, Any] = {}
+    for source in sources:
+        constructor = isinstance(source, type) and not dataclasses.is_dataclass(source)
+        out |= get_type_hints(source.__init__ if constructor else source)  # type: ignore[misc]
+    return out
 
 
 def sections(settings: type) -> dict[str, type]:
@@ -96,29 +118,31 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
     Raises:
         ValueError: for a name that the dataclass lacks, one that it needs, or (from its own checks) a bad value;
             always with the section before the name. Also for a value in place of a section.
+        TypeError: for a value of another type than the field's.
 
     Example:
         >>> Flight = from_signatures("Flight", "How to fly.", lambda *, speed=3.0: None)
         >>> build(Flight, {"sped": 2.0}, "flight")
         Traceback (most recent call last):
         ...
-        ValueError: flight has no setting sped. It has: speed.
+        ValueError: flight has no setting sped: did you mean flight.speed? It has: speed.
     """
-    nested = sections(settings)
+    nested, hints = sections(settings), get_type_hints(settings)
     fields = dataclasses.fields(settings)  # type: ignore[arg-type]
     names = [field.name for field in fields]
+    prefix = f"{where}." if where else ""
     for key in values:
         if key not in names:
-            raise ValueError(f"{where or 'The run'} has no setting {key}. It has: {', '.join(names)}.")
-    prefix = f"{where}." if where else ""
+            raise ValueError(unknown(key, names, where, [prefix + name for name in leaves(settings)]))
     arguments: dict[str, Any] = {}
     for key, value in values.items():
         if key in nested:
-            if value is not None and not isinstance(value, Mapping):
-                raise ValueError(f"{prefix}{key} is a section, got {value!r}: set {prefix}{key}.KEY=VALUE.")
-            arguments[key] = build(nested[key], value or {}, prefix + key)
+            if not isinstance(value, Mapping):
+                shown = "null" if value is None else repr(value)
+                raise ValueError(f"{prefix}{key} is a section, got {shown}: set {prefix}{key}.KEY=VALUE.")
+            arguments[key] = build(nested[key], value, prefix + key)
         elif value != MISSING:
-            arguments[key] = _tuples(value)
+            arguments[key] = typed(value, hints[key], prefix + key)
     required = {
         field.name
         for field in fields
@@ -130,6 +154,34 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
         raise ValueError(f"{prefix}{missing[0]} must be given: it has no default.")
     with errors_of(where, names):
         return settings(**arguments)
+
+
+def unknown(key: str, names: Iterable[str], where: str, known: Iterable[str]) -> str:
+    """The error for a name that a section lacks.
+
+    Args:
+        key: the name.
+        names: those that the section has.
+        where: the section; empty for the whole.
+        known: names with their sections, of which the nearest is proposed.
+    """
+    nearest = did_you_mean(f"{where}.{key}" if where else key, known)
+    return f"{where or 'The run'} has no setting {key}{nearest or '.'} It has: {', '.join(names)}."
+
+
+def leaves(settings: type) -> list[str]:
+    """The names of all settings within a dataclass, with their sections.
+
+    Example:
+        >>> leaves(from_signatures("Flight", "How to fly.", lambda *, speed=3.0: None))
+        ['speed']
+    """
+    nested = sections(settings)
+    out = []
+    for field in dataclasses.fields(settings):
+        inner = [f"{field.name}.{name}" for name in leaves(nested[field.name])] if field.name in nested else []
+        out += inner or [field.name]
+    return out
 
 
 def as_dict(settings: Any) -> dict[str, Any]:
@@ -163,7 +215,3 @@ def errors_of(section: str, names: Collection[str]) -> Iterator[None]:
 
 def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, tuple | list) else value

@@ -15,10 +15,12 @@ from ls3_recipes.console import console, print_summary
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.figures import Figures, best_update, episode_figures, means_of, summarise
 from ls3_recipes.options import as_dict
-from ls3_recipes.plots.run import plot_run
+from ls3_recipes.plots.run import pictures_of_run
+from ls3_recipes.plots.style import draw
 from ls3_recipes.rollout import collect_demonstrations, make_env, run_episodes, tick, whole_episodes
-from ls3_recipes.run_folder import RunFolder
+from ls3_recipes.run_folder import RunFolder, require_new
 from ls3_recipes.run_settings import RunSettings
+from ls3_recipes.together import require_room, require_tools
 from ls3_torchrl.data import Tag, load_episodes, save_episodes
 from ls3_torchrl.trainers.learner import log_scalars
 from ls3_torchrl.trainers.progress import progress_bar
@@ -65,6 +67,7 @@ class Experiment:
     """
 
     def __init__(self, settings: RunSettings) -> None:
+        require_new(settings.output)
         self.settings, self.seed = settings, seeds(settings.seed)
         self.device = choose_device(settings.device)
         if settings.threads:
@@ -72,10 +75,12 @@ class Experiment:
         torch.manual_seed(self.seed["learning"])
         self.env = make_env(settings.task, settings.online.episodes_per_update, self.seed["online"], self.device)
         self.horizon: int = self.env.base_env.horizon
+        require_tools(settings, self.env.observation_spec["pixels"].shape[-3], self.horizon)
         self.algorithm = ALGORITHMS[settings.algorithm](settings, self.env, self.device)
         self.algorithm.prepare(self.env)
         self.buffer = self.algorithm.make_buffer(self.device)
         self.offline: Offline = self._given_data() if settings.data else {}
+        require_room(settings, self.offline, self.horizon)
         self.online: list[Figures] = []
         self.tracks: list[torch.Tensor] = []
         self.seconds: dict[str, float] = {}
@@ -185,19 +190,29 @@ class Experiment:
             self.probe = self.algorithm.diagnose(self.offline, self.evaluation)
 
     def finish(self) -> dict:
-        """Leave pictures and summary."""
+        """Leave the summary, then pictures, then both."""
         summary = self._summary()
+        self._write(summary)
         if self.settings.pictures:
             with self._timed("pictures"):
-                torch.save(self.tracks, self.folder.path / "online_tracks.pt")
-                plot_run(self.folder.path, self.settings.task, self.offline, self.tracks, self.evaluation)
-                self.algorithm.plot(self.folder.path, self.offline, self.evaluation)
-        summary["minutes"] = self.folder.minutes
-        summary["seconds"] = {name: round(value, 1) for name, value in self.seconds.items()}
-        self.folder.write_json("summary.json", summary)
+                failed = self._draw()
+            summary |= {"failed_pictures": failed} if failed else {}
+            self._write(summary)
         self.folder.close()
         print_summary(summary, self.folder.path)
         return summary
+
+    def _draw(self) -> dict[str, str]:
+        """Draw all pictures; those that failed, with the reasons."""
+        folder = self.folder.path
+        torch.save(self.tracks, folder / "online_tracks.pt")
+        failed = draw(pictures_of_run(folder, self.settings.task, self.offline, self.tracks, self.evaluation))
+        return failed | draw(self.algorithm.pictures(folder, self.offline, self.evaluation))
+
+    def _write(self, summary: dict) -> None:
+        summary["minutes"] = self.folder.minutes
+        summary["seconds"] = {name: round(value, 1) for name, value in self.seconds.items()}
+        self.folder.write_json("summary.json", summary)
 
     def _summary(self) -> dict:
         return {

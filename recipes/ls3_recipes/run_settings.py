@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import ls3_envs
 from ls3_recipes.options import from_signatures
-from ls3_torchrl._checks import require_at_least, require_choice
+from ls3_torchrl._checks import require_at_least, require_choice, require_positive, require_unit_interval
 from ls3_torchrl.agent import AgentArchitecture
 from ls3_torchrl.data import TaggedReplayBuffer
 from ls3_torchrl.trainers import VAEOptions
+
+#: The parts of a run have seeds of their own, up to ten thousand times as large.
+_LARGEST_SEED = 10**14
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,20 +70,66 @@ class EvaluationSettings:
         require_at_least(self.episodes, 1, "episodes")
 
 
+def require_seed(seed: int, name: str = "seed") -> int:
+    """Return a seed that every random stream can start from; raise ``ValueError`` otherwise."""
+    if not 0 <= seed <= _LARGEST_SEED:
+        raise ValueError(f"{name} must lie between 0 and {_LARGEST_SEED}, got {seed}.")
+    return seed
+
+
+def require_path(path: str | None, name: str) -> None:
+    """Raise ``ValueError`` for a path that names nothing."""
+    if path is not None and (not path.strip() or "\0" in path):
+        raise ValueError(f"{name} must be the path of a file or folder, got {path!r}.")
+
+
+def require_threads(threads: int | None) -> None:
+    """Raise ``ValueError`` for a number of threads that nothing can run on."""
+    if threads is not None and threads < 1:
+        raise ValueError(f"threads must be at least 1, or null for PyTorch's own choice; got {threads}.")
+
+
+def _check_architecture(action_scale: Any, **sizes: Any) -> None:
+    AgentArchitecture(action_dim=1, **sizes)
+    for scale in action_scale if isinstance(action_scale, tuple) else (action_scale,):
+        if scale != "box":
+            require_positive(scale, "action_scale")
+
+
 #: The networks' sizes; what the environment decides is not set.
 AgentSettings = from_signatures(
     "AgentSettings",
     "The arguments of :class:`~ls3_torchrl.agent.AgentArchitecture` that the environment does not decide.",
     AgentArchitecture,
     without=("action_dim", "in_channels"),
+    types={"action_scale": float | tuple[float, ...] | Literal["box"]},
+    check=_check_architecture,
 )
+
+
+def check_buffer(capacity: int, gamma: float, success_tail: int | None, **_: bool) -> None:
+    """Raise ``ValueError`` for settings that no replay buffer can have."""
+    require_at_least(capacity, 1, "capacity")
+    require_unit_interval(gamma, "gamma")
+    if success_tail is not None:
+        require_at_least(success_tail, 1, "success_tail")
+
 
 BufferSettings = from_signatures(
     "BufferSettings",
     "The arguments of :class:`~ls3_torchrl.data.TaggedReplayBuffer` that matter to every algorithm.",
     TaggedReplayBuffer,
     only=("capacity", "gamma", "success_tail", "dynamics_after_violation"),
+    check=check_buffer,
 )
+
+
+def require_within(steps: int, episode: int, name: str) -> None:
+    """Raise ``ValueError`` for more steps than an episode has."""
+    if steps > episode:
+        raise ValueError(
+            f"{name} must not exceed the {episode} steps of an episode, got {steps}. Lower it, or raise task.horizon."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +143,8 @@ class RunSettings:
         output: the run's folder; one that exists is never written into.
         data: a folder of episodes made by ``ls3 collect``; ``None`` collects them anew.
         scratch_dir: memory-map the replay buffer in this folder instead of holding it in memory.
-        device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
-        threads: intra-op threads; ``None`` leaves PyTorch's choice.
+        device: ``"auto"``, ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+        threads: intra-op threads, at least 1; ``None`` leaves PyTorch's choice.
         pictures: leave pictures in the run's folder.
         task: what is learnt.
         agent: sizes of the networks. To a baseline that reads latents, all of them matter: it makes the whole agent, so
@@ -122,6 +171,19 @@ class RunSettings:
     buffer: BufferSettings  # type: ignore[valid-type]
     online: EpisodeSettings
     evaluation: EvaluationSettings
+
+    def __post_init__(self) -> None:
+        """Refuse what no run can have."""
+        require_seed(self.seed)
+        for name in ("output", "data", "scratch_dir"):
+            require_path(getattr(self, name), name)
+        require_threads(self.threads)
+
+    def require_horizon(self, steps: int) -> None:
+        """Raise ``ValueError`` for a setting that does not fit episodes of so many steps."""
+        vae = self.vae
+        if vae.prediction_weight and vae.checkpoint is None and not self.unread.get("vae"):
+            require_within(vae.prediction_horizon, steps, "vae.prediction_horizon")
 
     @property
     def unread(self) -> dict[str, str]:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hydra.errors import ConfigCompositionException, MissingConfigException
 from omegaconf import OmegaConf
 from torchrl.data import Bounded
 
@@ -168,16 +167,16 @@ def test_every_domain_has_a_file_of_settings_and_every_file_a_domain():
 @pytest.mark.parametrize(
     ("override", "error", "message"),
     [
-        (
-            "task=moon_landing",
-            MissingConfigException,
-            r"(?s)task/moon_landing.*Available options in 'task'.*navigation",
-        ),
-        ("preset=fast", MissingConfigException, r"(?s)preset/fast.*Available options in 'preset'.*cpu.*paper.*smoke"),
-        ("planner.num_candidate=5", ConfigCompositionException, r"Could not override 'planner\.num_candidate'"),
-        ("sead=1", ConfigCompositionException, "Could not override 'sead'"),
-        ("+planner.num_candidate=5", ValueError, r"planner has no setting num_candidate\. It has: horizon, "),
-        ("+sead=1", ValueError, r"The run has no setting sead\. It has: algorithm, "),
+        ("task=moon_landing", ValueError, r"^task must be one of cable_routing, navigation, .*; got 'moon_landing'\.$"),
+        ("task=navigaton", ValueError, r"^task must be one of .*; got 'navigaton': did you mean navigation\?$"),
+        ("preset=fast", ValueError, r"^preset must be one of cpu, paper, smoke; got 'fast'\."),
+        ("tuned=foo", ValueError, r"^tuned must be one of cable_routing-cpu, .*; got 'foo'\."),
+        ("planner.num_candidate=5", ValueError, r"^planner has no setting num_candidate: did you mean planner\.num_c"),
+        ("sead=1", ValueError, r"^The run has no setting sead: did you mean seed\? It has: algorithm, "),
+        ("+planner.num_candidate=5", ValueError, r"^planner has no setting num_candidate: .* It has: horizon, "),
+        ("+planner.foo=1", ValueError, r"^planner has no setting foo\. It has: horizon, "),
+        ("horizon=5", ValueError, r"^The run has no setting horizon: did you mean task\.horizon or planner\.horizon\?"),
+        ("seed.x=5", ValueError, r"^seed is one setting, not a section: seed\.x is none\. Write seed=VALUE\."),
         ("algorithm=dqn", ValueError, "algorithm must be one of ls3, sacfd, awac, bc; got 'dqn'"),
     ],
 )
@@ -274,7 +273,7 @@ def test_a_file_with_a_setting_that_nobody_has_is_refused(setting, message):
         ("loss.monte_carlo=true", r"^loss\.monte_carlo needs buffer\.continue_failures=true"),
         ("online.updates=-1", r"^online\.updates"),
         ("online.episodes_per_update=0", r"^online\.episodes_per_update"),
-        ("online.select=first", r"^online\.select must be one of 'last', 'best'; got 'first'"),
+        ("online.select=first", r"^online\.select must be one of 'last', 'best', got 'first'"),
         ("online.fraction=1.0", r"^online\.fraction"),
         ("online.dynamics_steps=-1", r"^online\.dynamics_steps"),
         ("evaluation.episodes=0", r"^evaluation\.episodes"),
@@ -313,7 +312,7 @@ def test_impossible_settings_are_refused_by_their_full_names(override, message):
 )
 def test_impossible_settings_of_baselines_are_refused_by_their_full_names(algorithm, override):
     name = override.split("=")[0].replace(".", r"\.")
-    with pytest.raises(ValueError, match=f"^{name}"):
+    with pytest.raises((ValueError, TypeError), match=f"^{name}"):
         train_settings(f"algorithm={algorithm}", "preset=smoke", override)
 
 

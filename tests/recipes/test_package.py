@@ -8,15 +8,21 @@ import pytest
 PACKAGE = Path(__file__).parents[2] / "recipes" / "ls3_recipes"
 
 # What each part may import of the package, besides itself.
-LOWEST = {"arguments", "options", "renamed", "console", "device", "figures"}
+LOWEST = {"arguments", "options", "renamed", "console", "device", "figures", "typed"}
 MAY_IMPORT: dict[str, set[str]] = {part: set() for part in LOWEST}
+MAY_IMPORT["options"] = {"typed"}
+MAY_IMPORT["overrides"] = {"options", "typed"}
+MAY_IMPORT["relevance"] = {"arguments", "options", "run_settings", "algorithms"}
 MAY_IMPORT["run_settings"] = {"options"}
 MAY_IMPORT["run_folder"] = set()
 MAY_IMPORT["rollout"] = {"console", "run_settings"}
-MAY_IMPORT["plots"] = {"run_folder", "run_settings"}
-MAY_IMPORT["algorithms"] = {"options", "run_settings", "plots"}
-MAY_IMPORT["configuration"] = {"arguments", "options", "renamed", "run_settings", "algorithms"}
-MAY_IMPORT["protocol"] = LOWEST | {"run_settings", "run_folder", "rollout", "plots", "algorithms"}
+MAY_IMPORT["plots"] = {"console", "run_folder", "run_settings"}
+MAY_IMPORT["algorithms"] = {"figures", "options", "run_settings", "plots"}
+MAY_IMPORT["composition"] = {"overrides", "run_folder"}
+MAY_IMPORT["configuration"] = LOWEST | {"composition", "overrides", "relevance"}
+MAY_IMPORT["configuration"] |= {"run_folder", "run_settings", "algorithms"}
+MAY_IMPORT["together"] = {"options", "rollout", "run_folder", "run_settings"}
+MAY_IMPORT["protocol"] = LOWEST | {"together", "run_settings", "run_folder", "rollout", "plots", "algorithms"}
 MAY_IMPORT["benchmark"] = LOWEST | {"run_settings", "run_folder", "algorithms", "configuration"}
 MAY_IMPORT["commands"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"commands"}
@@ -65,5 +71,5 @@ def test_a_file_is_one_idea_and_a_function_one_thought(path):
 
 def test_no_setting_of_hydra_travels_below_the_doors():
     for path in sources():
-        if part_of(path) not in ("configuration",):
+        if part_of(path) not in ("configuration", "composition"):
             assert "DictConfig" not in path.read_text(), path.name

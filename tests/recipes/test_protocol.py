@@ -100,15 +100,14 @@ def test_data_of_another_task_are_refused_before_any_work(no_work, tmp_path):
     ],
 )
 def test_impossible_settings_are_refused_before_any_work(no_work, tmp_path, override, error, message):
-    config = settings(f"output={tmp_path / 'run'}", override)
     with pytest.raises(error, match=message):
-        run_experiment(config)
+        run_experiment(settings(f"output={tmp_path / 'run'}", override))
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device to choose")
 def test_cuda_without_a_device_is_refused_before_any_work(no_work, tmp_path):
-    config = settings("device=cuda", f"output={tmp_path / 'run'}")
+    config = train_settings("preset=smoke", "device=cuda", f"output={tmp_path / 'run'}")
     with pytest.raises(ValueError, match="device=cuda was asked for, but PyTorch sees no CUDA device"):
         run_experiment(config)
     assert not (tmp_path / "run").exists()

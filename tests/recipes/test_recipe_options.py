@@ -75,7 +75,10 @@ def test_nested_settings_are_built_with_defaults_and_lists_as_tuples_and_back():
     ("values", "message"),
     [
         ({"middle": {"inner": {"size": 0}}}, r"^middle\.inner\.size must be at least 1, got 0\.$"),
-        ({"middle": {"inner": {"sise": 2}}}, r"^middle\.inner has no setting sise\. It has: size, rates\.$"),
+        (
+            {"middle": {"inner": {"sise": 2}}},
+            r"^middle\.inner has no setting sise: did you mean middle\.inner\.size\? It has: size, rates\.$",
+        ),
         ({"middle": "a"}, r"^middle is a section, got 'a': set middle\.KEY=VALUE\.$"),
         ({"middle": {"inner": 3}}, r"^middle\.inner is a section, got 3: set middle\.inner\.KEY=VALUE\.$"),
         ({"midle": {}}, r"^The run has no setting midle\. It has: middle, names\.$"),

@@ -23,6 +23,7 @@ class ActorCritic(Baseline):
 
     #: Trains actor and critic together.
     both: Learner
+    draws_fields = True
     #: Taken off every reward.
     bonus = 0.0
 

@@ -14,7 +14,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.record.loggers import Logger
 
 from ls3_recipes.options import as_dict, errors_of
-from ls3_recipes.plots.style import Label
+from ls3_recipes.plots.style import Label, Pictures
 from ls3_recipes.run_settings import RunSettings
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
@@ -97,8 +97,9 @@ class Algorithm(ABC):
     def restore(self, path: Path) -> None:
         """Take the networks of a file."""
 
-    def plot(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> None:  # noqa: B027
-        """Pictures of its own, in addition to those that every run leaves."""
+    def pictures(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> Pictures:
+        """What draws pictures of its own into a folder, in addition to those that every run leaves."""
+        return {}
 
 
 def make_agent(

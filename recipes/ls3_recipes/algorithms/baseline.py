@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -16,12 +17,14 @@ from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 from torchrl.objectives import BCLoss, LossModule
 from torchrl.record.loggers import Logger
 
+from ls3_envs import VisualConstraintEnv
 from ls3_recipes.algorithms.base import Algorithm, make_agent
 from ls3_recipes.plots.agent import plot_reconstructions
 from ls3_recipes.plots.plane import Field, maps, over_plane, plane_of
+from ls3_recipes.plots.style import Pictures
 from ls3_recipes.run_settings import RunSettings
 from ls3_torchrl import LS3Agent
-from ls3_torchrl._checks import require_at_least, require_choice, require_positive
+from ls3_torchrl._checks import require_at_least, require_choice, require_positive, require_unit_interval
 from ls3_torchrl.baselines import PixelFeatures, action_bounds
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.files import save_atomically
@@ -64,7 +67,7 @@ class ActorCriticSettings(PolicySettings):
     Args:
         penalty: λ, added to the reward of a violation; at most 0.
         initial_std: of an untrained actor, before squashing.
-        tau: of the lagged critics; a value that is wrong for ever sinks by 1 in 1 / tau steps.
+        tau: of the lagged critics, in (0, 1]; a value that is wrong for ever sinks by 1 in 1 / tau steps.
         zero_at_goal: the goal ends the task, whatever happens after.
         critic_steps: gradient steps offline.
         updates_per_step: gradient steps online, for each step of the environment.
@@ -84,6 +87,7 @@ class ActorCriticSettings(PolicySettings):
             raise ValueError(f"penalty is added to the reward of a violation: 0 or below, got {self.penalty}.")
         require_positive(self.initial_std, "initial_std")
         require_positive(self.tau, "tau")
+        require_unit_interval(self.tau, "tau")
         require_at_least(self.critic_steps, 0, "critic_steps")
         if self.updates_per_step < 0:
             raise ValueError(f"updates_per_step must be at least 0, got {self.updates_per_step}.")
@@ -104,6 +108,7 @@ class BaselineSettings(RunSettings):
 
     def __post_init__(self) -> None:
         """Refuse unknown encoders."""
+        super().__post_init__()
         require_choice(self.encoder, ("latents", "conv"), "encoder")
 
     @property
@@ -116,6 +121,8 @@ class Baseline(Algorithm):
     """Actor, and what it reads: the frozen latents of LS³'s VAE, or images through convolutions of its own."""
 
     settings: BaselineSettings
+    #: Whether :meth:`fields` has any.
+    draws_fields = False
 
     def __init__(self, settings: BaselineSettings, env: TransformedEnv, device: torch.device) -> None:
         self.settings = settings
@@ -209,29 +216,41 @@ class Baseline(Algorithm):
 
     def restore(self, path: Path) -> None:
         """Take the weights of a file of the same algorithm."""
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        if content.get("format") != FORMAT or content["version"] != VERSION or content["algorithm"] != self.name:
-            raise ValueError(f"{path} holds no networks of {self.name}. Pass a file that this algorithm's run wrote.")
-        self.networks.load_state_dict(content["state_dict"])
+        if not path.is_file():
+            raise FileNotFoundError(f"There are no networks at {path}. Pass a file that this algorithm's run wrote.")
+        advice = f"{path} holds no networks of {self.name}, or is damaged. Pass a file that this algorithm's run wrote."
+        try:
+            content = torch.load(path, map_location="cpu", weights_only=True)
+        except (EOFError, RuntimeError, KeyError, pickle.UnpicklingError) as error:
+            raise ValueError(advice) from error
+        wanted = {"format": FORMAT, "version": VERSION, "algorithm": self.name}
+        if not isinstance(content, dict) or {key: content.get(key) for key in wanted} != wanted:
+            raise ValueError(advice)
+        try:
+            self.networks.load_state_dict(content["state_dict"])
+        except (KeyError, RuntimeError, TypeError) as error:
+            raise ValueError(f"The weights in {path} do not fit the run's settings: {error}.") from error
 
     def fields(self, rows: TensorDictBase) -> dict[str, Field]:
         """What can be drawn over the plane, of rows ``[n]`` with observation and the actor's action."""
         return {}
 
-    @torch.no_grad()
-    def plot(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> None:
+    def pictures(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> Pictures:
         """Reconstructions of the VAE; value and risk over the plane where the states are one."""
+        pictures: Pictures = {}
         if self.vae is not None:
-            plot_reconstructions(folder, self.vae, offline)
+            agent = self.vae
+            pictures["reconstructions.png"] = lambda: plot_reconstructions(folder, agent, offline)
         env = plane_of(self.settings.task)
-        if env is None:
-            return
+        if env is not None and self.draws_fields:
+            pictures["heatmaps.png"] = lambda: self._plot_fields(folder, env, offline)
+        return pictures
 
+    @torch.no_grad()
+    def _plot_fields(self, folder: Path, env: VisualConstraintEnv, offline: dict[Tag, TensorDictBase]) -> None:
         def act(pixels: Tensor) -> TensorDictBase:
             rows = TensorDict({"pixels": pixels.to(self.half.device)}, [len(pixels)])
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 return self._seeing(self.networks["actor"])(rows)
 
-        fields = self.fields(over_plane(env, act))
-        if fields:
-            maps(folder, env, fields, offline)
+        maps(folder, env, self.fields(over_plane(env, act)), offline)

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.data import Bounded
 from torchrl.envs import TransformedEnv
 from torchrl.record.loggers import Logger
 
 from ls3_recipes.algorithms.base import Algorithm, make_agent
+from ls3_recipes.figures import as_one_shape
 from ls3_recipes.options import as_dict, errors_of, from_signatures
-from ls3_recipes.plots.agent import plot_agent
-from ls3_recipes.plots.style import Label
-from ls3_recipes.run_settings import EpisodeSettings, RunSettings
+from ls3_recipes.plots.agent import pictures_of_agent
+from ls3_recipes.plots.style import Label, Pictures
+from ls3_recipes.run_settings import EpisodeSettings, RunSettings, check_buffer, require_within
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
-from ls3_torchrl.planners import CrossEntropyMethod, LS3Planner, describe_plan
+from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
+from ls3_torchrl.planners import CrossEntropyMethod, LatentEnv, LS3Planner, describe_plan
 from ls3_torchrl.trainers import (
     LossOptions,
     LS3Options,
@@ -46,13 +50,27 @@ BufferSettings = from_signatures(
     "The arguments of :class:`~ls3_torchrl.data.TaggedReplayBuffer` that matter to LS³.",
     TaggedReplayBuffer,
     only=("capacity", "gamma", "success_tail", "dynamics_after_violation", "continue_failures"),
+    check=check_buffer,
 )
+
+
+@cache
+def _smallest_model() -> tuple[LatentEnv, ValueEnsemble, SafeSet]:
+    """Something to plan with, for no other purpose than to have a planner's settings checked."""
+    with torch.random.fork_rng(devices=[]):
+        spec, hidden = Bounded(low=-1.0, high=1.0, shape=(1,)), (1,)
+        dynamics = EnsembleDynamics(1, 1, num_members=1, hidden=hidden)
+        heads = ConstraintEstimator(1, hidden=hidden), GoalEstimator(1, hidden=hidden)
+        model = LatentEnv(dynamics, *heads, action_spec=spec)
+        return model, ValueEnsemble(1, num_members=1, hidden=hidden), SafeSet(1, hidden=hidden)
+
 
 PlannerSettings = from_signatures(
     "PlannerSettings",
     "The options of :class:`~ls3_torchrl.planners.LS3Planner` and of the cross-entropy method.",
     LS3Planner,
     CrossEntropyMethod,
+    check=lambda **settings: LS3Planner(*_smallest_model(), **settings),
 )
 
 
@@ -69,11 +87,24 @@ class LS3Settings(RunSettings):
 
     def __post_init__(self) -> None:
         """Refuse what only the sections together are wrong in."""
+        super().__post_init__()
+        if as_dict(self.buffer)["continue_failures"] and as_dict(self.buffer)["gamma"] == 1.0:
+            raise ValueError(
+                "buffer.gamma must be below 1 with buffer.continue_failures=true, got 1.0: a failure that goes on for "
+                "ever would return minus infinity. Lower it, for example to 0.99, or set "
+                "buffer.continue_failures=false and loss.monte_carlo=false."
+            )
         if self.loss.monte_carlo and not as_dict(self.buffer)["continue_failures"]:
             raise ValueError(
                 "loss.monte_carlo needs buffer.continue_failures=true: otherwise a failure's return ends with the "
                 "horizon and is no lower bound."
             )
+
+    def require_horizon(self, steps: int) -> None:
+        """Raise ``ValueError`` for a setting that does not fit episodes of so many steps."""
+        super().require_horizon(steps)
+        require_within(self.loss.dynamics_horizon, steps, "loss.dynamics_horizon")
+        require_within(as_dict(self.planner)["horizon"], steps, "planner.horizon")
 
     @property
     def training(self) -> LS3Options:
@@ -132,9 +163,9 @@ class LS3(Algorithm):
         """Take the networks of such a file; one of another shape, or with actions in other units, is refused."""
         self.agent.load_state_dict(LS3Agent.load(path, **asdict(self.agent.architecture)).state_dict())
 
-    def plot(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> None:
+    def pictures(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> Pictures:
         """Reconstructions, timelines, and maps and plans where the states are a plane."""
-        plot_agent(folder, self.settings, self.agent, self.policy, offline, evaluation)
+        return pictures_of_agent(folder, self.settings, self.agent, self.policy, offline, evaluation)
 
 
 def probe(agent: LS3Agent, offline: list[TensorDictBase], evaluation: TensorDictBase, horizon: int) -> dict[str, float]:
@@ -142,6 +173,7 @@ def probe(agent: LS3Agent, offline: list[TensorDictBase], evaluation: TensorDict
 
     Nothing where the episodes keep no state, or are shorter than the horizon.
     """
+    offline = [as_one_shape(part) for part in offline]
     episodes = [*offline, evaluation]
     if any(part.get("state", None) is None for part in episodes) or evaluation.shape[1] < horizon:
         return {}

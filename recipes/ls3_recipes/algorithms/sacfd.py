@@ -76,12 +76,6 @@ class SACfDSettings(BaselineSettings):
     recovery: bool = False
     policy: SACfDPolicySettings
 
-    def __post_init__(self) -> None:
-        """Refuse what is neither with nor without."""
-        super().__post_init__()
-        if not isinstance(self.recovery, bool):
-            raise ValueError(f"recovery must be true or false, got {self.recovery!r}.")
-
     @property
     def unread(self) -> dict[str, str]:
         """Without recovery, nothing of the safety critic."""

@@ -23,7 +23,8 @@ from ls3_recipes.configuration import train_settings
 from ls3_recipes.console import console
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.options import as_dict
-from ls3_recipes.run_folder import RunFolder
+from ls3_recipes.run_folder import RunFolder, require_new
+from ls3_recipes.run_settings import require_path, require_threads
 from ls3_torchrl import LS3Agent
 from ls3_torchrl._checks import require_at_least, require_choice, require_positive
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
@@ -64,14 +65,19 @@ class BenchmarkSettings:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be timed; encoder and buffer are timed at the first preset's sizes."""
-        if not self.presets:
-            raise ValueError("presets must name at least one preset, such as presets=[cpu]; got none.")
-        for domain in (self.task, *(self.domains or ())):
+        for name, example in (("presets", "cpu"), ("batches", "1")):
+            if not getattr(self, name):
+                raise ValueError(f"{name} must name at least one, such as {name}=[{example}]; got none.")
+        require_choice(self.task, tuple(ls3_envs.DOMAINS), "task")
+        for domain in self.domains or ():
             require_choice(domain, tuple(ls3_envs.DOMAINS), "domains")
         for batch in self.batches:
             require_at_least(batch, 1, "batches")
         require_at_least(self.states, 1, "states")
         require_positive(self.seconds, "seconds")
+        require_threads(self.threads)
+        for name in ("output", "agent"):
+            require_path(getattr(self, name), name)
 
 
 def run_benchmark(settings: BenchmarkSettings) -> dict:
@@ -81,6 +87,9 @@ def run_benchmark(settings: BenchmarkSettings) -> dict:
         What is written to ``benchmark.json``.
     """
     device = choose_device(settings.device)
+    require_new(settings.output)
+    if settings.agent is not None:
+        LS3Agent.load(settings.agent)
     if settings.threads:
         torch.set_num_threads(settings.threads)
     presets = [_preset(settings.task, name) for name in settings.presets]

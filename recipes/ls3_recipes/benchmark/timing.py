@@ -102,5 +102,5 @@ def show(rows: list[dict[str, Any]], folder: Path) -> None:
     wide.print(table)
     rule = "|---|" + "---:|" * (len(columns) - 1)
     text = [f"| {' | '.join(line)} |" for line in (columns, *lines)]
-    (folder / "benchmark.md").write_text("\n".join([text[0], rule, *text[1:], "", caption, ""]))
+    (folder / "benchmark.md").write_text("\n".join([text[0], rule, *text[1:], "", caption, ""]), encoding="utf-8")
     console.print(f"benchmark.json and benchmark.md are in [bold]{folder}[/bold]")

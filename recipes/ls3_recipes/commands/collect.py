@@ -12,7 +12,7 @@ from ls3_recipes.console import console, percent_of
 from ls3_recipes.figures import episode_figures, summarise
 from ls3_recipes.rollout import collect_demonstrations
 from ls3_recipes.run_folder import require_new
-from ls3_recipes.run_settings import TaskSettings
+from ls3_recipes.run_settings import TaskSettings, require_path, require_seed
 from ls3_torchrl.data import save_episodes
 
 HELP = """
@@ -39,6 +39,16 @@ class CollectSettings:
     task: TaskSettings
     seed: int = 0
     output: str
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be collected."""
+        require_seed(self.seed)
+        require_path(self.output, "output")
+        if self.task.horizon is not None:
+            raise ValueError(
+                f"task.horizon matters to ls3 train alone, got {self.task.horizon}: offline episodes have the domain's "
+                "own length. Leave it out."
+            )
 
 
 register("collect", CollectSettings)
@@ -67,4 +77,4 @@ def collect(settings: CollectSettings) -> Path:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    run_command("collect", CollectSettings, collect, arguments, help_text=HELP, groups=("task",))
+    run_command("collect", CollectSettings, collect, arguments, help_text=HELP)

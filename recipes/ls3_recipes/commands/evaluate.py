@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, make_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import torch
 
@@ -16,11 +16,12 @@ from ls3_recipes.configuration import register, run_command, settings_of_run
 from ls3_recipes.console import print_summary
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.figures import episode_figures, summarise
-from ls3_recipes.options import as_dict, defaults
+from ls3_recipes.options import as_dict, defaults, errors_of
 from ls3_recipes.plots.run import save_video
+from ls3_recipes.plots.style import draw
 from ls3_recipes.rollout import make_env, run_episodes
-from ls3_recipes.run_folder import RunFolder
-from ls3_recipes.run_settings import RunSettings
+from ls3_recipes.run_folder import RunFolder, require_new
+from ls3_recipes.run_settings import RunSettings, require_path, require_seed
 from ls3_torchrl._checks import require_at_least
 
 HELP = """
@@ -36,7 +37,9 @@ Examples
 
 #: Each planner setting in place of the run's, which ``None`` keeps.
 PlannerChanges = make_dataclass(
-    "PlannerChanges", [(name, Any, field(default=None)) for name in defaults(PlannerSettings)], frozen=True
+    "PlannerChanges",
+    [(name, hint | None, field(default=None)) for name, hint in get_type_hints(PlannerSettings).items()],
+    frozen=True,
 )
 
 
@@ -65,6 +68,9 @@ class EvaluateSettings:
     def __post_init__(self) -> None:
         """Refuse an evaluation of nothing."""
         require_at_least(self.episodes, 1, "episodes")
+        require_seed(self.seed)
+        for name in ("run", "agent", "output"):
+            require_path(getattr(self, name), name)
 
     @property
     def planner_changes(self) -> dict[str, Any]:
@@ -87,7 +93,8 @@ def trained_settings(settings: EvaluateSettings) -> RunSettings:
     if not isinstance(trained, LS3Settings):
         named = ", ".join(f"planner.{name}={value}" for name, value in changes.items())
         raise ValueError(f"{settings.run} is a run of {trained.algorithm}, which has no planner: leave out {named}.")
-    return replace(trained, planner=replace(trained.planner, **changes))
+    with errors_of("planner", defaults(PlannerSettings)):
+        return replace(trained, planner=replace(trained.planner, **changes))
 
 
 def evaluate(settings: EvaluateSettings) -> dict:
@@ -101,15 +108,18 @@ def evaluate(settings: EvaluateSettings) -> dict:
         FileExistsError: when the output folder exists.
     """
     device, trained = choose_device(settings.device), trained_settings(settings)
+    require_new(settings.output)
     torch.manual_seed(settings.seed)
     env = make_env(trained.task, settings.episodes, settings.seed, device)
+    if settings.planner_changes:
+        trained.require_horizon(env.base_env.horizon)
     algorithm = ALGORITHMS[trained.algorithm](trained, env, device)
     algorithm.prepare(env)
     file = Path(settings.run) / settings.agent
     algorithm.restore(file)
     folder = RunFolder(settings.output, as_dict(settings) | {"planner": as_dict(trained).get("planner", {})})
     episodes = run_episodes(env, algorithm.policy, what="Evaluation")
-    summary = {
+    summary: dict[str, Any] = {
         "algorithm": algorithm.name,
         "task": trained.task.name,
         "preset": trained.preset,
@@ -117,9 +127,11 @@ def evaluate(settings: EvaluateSettings) -> dict:
         "evaluation": summarise([episode_figures(episodes)]),
         "hardware": hardware(device),
         "agent": str(file),
+        "minutes": folder.minutes,
     }
-    save_video(folder.path / "evaluation.gif", episodes)
-    summary["minutes"] = folder.minutes
+    folder.write_json("summary.json", summary)
+    failed = draw({"evaluation.gif": lambda: save_video(folder.path / "evaluation.gif", episodes)})
+    summary |= {"minutes": folder.minutes} | ({"failed_pictures": failed} if failed else {})
     folder.write_json("summary.json", summary)
     folder.close()
     print_summary(summary, folder.path)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from matplotlib.backend_bases import FigureCanvasBase
+
 import ls3_envs
-from ls3_recipes.console import console
+from ls3_recipes.console import command_line, console
 from ls3_recipes.plots.gallery import plot_gallery
+from ls3_recipes.run_folder import require_writable
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -20,4 +24,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("file", type=Path, metavar="FILE.png", help="where the picture goes")
     parser.add_argument("--domains", nargs="+", default=list(ls3_envs.DOMAINS), choices=list(ls3_envs.DOMAINS))
     chosen = parser.parse_args(sys.argv[1:] if arguments is None else arguments)
-    console.print(f"The domains are in [bold]{plot_gallery(chosen.file, chosen.domains)}[/bold]")
+    who = "ls3 gallery"
+    with command_line(who):
+        try:
+            _require_picture(chosen.file)
+        except (ValueError, OSError) as error:
+            raise SystemExit(f"{who}: {error}") from None
+        chosen.file.parent.mkdir(parents=True, exist_ok=True)
+        console.print(f"The domains are in [bold]{plot_gallery(chosen.file, chosen.domains)}[/bold]")
+
+
+def _require_picture(path: Path) -> None:
+    """Refuse a file that no picture can be written to."""
+    formats = sorted(FigureCanvasBase.get_supported_filetypes())
+    if path.suffix.lower().lstrip(".") not in formats:
+        raise ValueError(f"FILE must end in one of .{', .'.join(formats)}; got {str(path)!r}.")
+    if path.is_dir() or (path.exists() and not os.access(path, os.W_OK)):
+        raise ValueError(f"{path} cannot be written. Choose another file.")
+    require_writable(path, "FILE")

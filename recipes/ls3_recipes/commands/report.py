@@ -12,7 +12,9 @@ from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.configuration import register, run_command
 from ls3_recipes.console import console
 from ls3_recipes.plots.report import check_alike, plot_report, read_run, rows_of
+from ls3_recipes.plots.style import draw
 from ls3_recipes.run_folder import require_new
+from ls3_recipes.run_settings import require_path
 
 #: How algorithms are shown, in the order of legend and table.
 LABELS = {name: label for algorithm in ALGORITHMS.values() for name, label in algorithm.labels.items()}
@@ -38,13 +40,15 @@ class ReportSettings:
         output: a folder that does not exist yet.
     """
 
-    runs: tuple[str, ...] = ()
+    runs: tuple[str, ...] | str = ()
     output: str
 
     def __post_init__(self) -> None:
         """Take a single folder as a list of one."""
         if isinstance(self.runs, str):
             object.__setattr__(self, "runs", (self.runs,))
+        for path in (*self.runs, self.output):
+            require_path(path, "output" if path is self.output else "runs")
 
 
 register("report", ReportSettings)
@@ -68,10 +72,10 @@ def report(settings: ReportSettings) -> list[dict[str, str]]:
     check_alike(runs)
     rows = rows_of(runs, LABELS)
     folder.mkdir(parents=True)
-    plot_report(runs, LABELS, folder / "comparison.png")
     lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
     lines += ["| " + " | ".join(row.values()) + " |" for row in rows]
-    (folder / "comparison.md").write_text("\n".join(lines) + "\n")
+    (folder / "comparison.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    draw({"comparison.png": lambda: plot_report(runs, LABELS, folder / "comparison.png")})
     _print(rows, f"{runs[0].summary['task']}: mean ± standard error over seeds")
     console.print(f"Picture and table are in [bold]{folder}[/bold]")
     return rows

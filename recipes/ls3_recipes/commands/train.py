@@ -6,7 +6,8 @@ import sys
 from collections.abc import Sequence
 
 from ls3_recipes.algorithms import ALGORITHMS
-from ls3_recipes.configuration import choices_of, run_command, settings_class_of
+from ls3_recipes.configuration import run_command, settings_class_of
+from ls3_recipes.overrides import choices_of
 from ls3_recipes.protocol import run_experiment
 
 
@@ -44,5 +45,4 @@ def main(arguments: Sequence[str] | None = None, *, algorithm: str | None = None
         settings = settings_class_of(arguments)
     except ValueError as error:
         raise SystemExit(f"ls3 train: {error}") from None
-    groups = ("algorithm", "task", "preset", "tuned")
-    run_command("train", settings, run_experiment, arguments, help_text=help_text(), groups=groups)
+    run_command("train", settings, run_experiment, arguments, help_text=help_text())

@@ -7,28 +7,32 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.artist import Artist
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ls3_envs import Plane, VisualConstraintEnv
 from ls3_recipes.plots.plane import Field, maps, over_plane, plane_of, plot_outlines, the_plane
-from ls3_recipes.plots.style import GOAL, INK, PALE, SAFE, UNSAFE, Axes, grid, image, line, picture
+from ls3_recipes.plots.style import GOAL, INK, PALE, SAFE, UNSAFE, Axes, Pictures, grid, image, line, picture
 from ls3_recipes.run_settings import RunSettings
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag
 from ls3_torchrl.modules import probability_of
+from ls3_torchrl.modules.call import call_on_latent
 from ls3_torchrl.planners import LS3Planner
 
 
-@torch.no_grad()
-def plot_agent(
+def pictures_of_agent(
     folder: Path,
     settings: RunSettings,
     agent: LS3Agent,
     planner: LS3Planner,
     offline: Mapping[Tag, TensorDictBase],
     evaluation: TensorDictBase,
-) -> None:
+) -> Pictures:
     """What an LS³ agent knows and plans.
 
     Args:
@@ -39,12 +43,15 @@ def plot_agent(
         offline: the demonstrations by tag.
         evaluation: the evaluation episodes ``[N, T]``.
     """
-    plot_reconstructions(folder, agent, offline)
-    plot_timelines(folder, agent, planner, offline, evaluation)
+    pictures: Pictures = {
+        "reconstructions.png": lambda: plot_reconstructions(folder, agent, offline),
+        "timelines.png": lambda: plot_timelines(folder, agent, planner, offline, evaluation),
+    }
     env = plane_of(settings.task)
     if env is not None:
-        maps(folder, env, agent_fields(env, agent, planner), offline)
-        plot_plans(folder, env, agent, planner, evaluation[0])
+        pictures["heatmaps.png"] = lambda: maps(folder, env, agent_fields(env, agent, planner), offline)
+        pictures["plans.png"] = lambda: plot_plans(folder, env, agent, planner, evaluation[0])
+    return pictures
 
 
 @torch.no_grad()
@@ -52,7 +59,7 @@ def plot_reconstructions(
     folder: Path, agent: LS3Agent, offline: Mapping[Tag, TensorDictBase], columns: int = 12
 ) -> None:
     """Images above what the VAE makes of them, taken from all data."""
-    frames = torch.cat([episodes["pixels"][:, ::7].flatten(0, 1) for episodes in offline.values()])
+    frames = torch.cat([episode["pixels"][::7] for episodes in offline.values() for episode in episodes.unbind(0)])
     frames = frames[torch.linspace(0, len(frames) - 1, columns).long()]
     assert agent.decoder is not None
     td = agent.decoder(agent.encoder(TensorDict({"pixels": frames.to(_device(agent))}, [columns])))
@@ -76,10 +83,16 @@ def _encode(agent: LS3Agent, pixels: Tensor) -> TensorDictBase:
 
 
 def _values(agent: LS3Agent, latent: Tensor) -> Tensor:
-    """Of every member, ``[n, M]``."""
-    return agent.value(TensorDict({"latent": latent}, [len(latent)]))["state_value"].squeeze(-1)
+    """Of every member, ``[n, M]``; M is 1 for a value that is no ensemble."""
+    return call_on_latent(agent.value, latent).reshape(len(latent), -1)
 
 
+def _correction(values: Tensor) -> int:
+    """Bessel's, where there are two members or more."""
+    return int(values.shape[-1] > 1)
+
+
+@torch.no_grad()
 def agent_fields(env: VisualConstraintEnv, agent: LS3Agent, planner: LS3Planner) -> dict[str, Field]:
     """Value, spread of the values, safe set, constraint and goal."""
     latent = over_plane(env, lambda pixels: _encode(agent, pixels))["latent"]
@@ -87,7 +100,7 @@ def agent_fields(env: VisualConstraintEnv, agent: LS3Agent, planner: LS3Planner)
     safe, unsafe = probability_of(agent.safe_set, latent), probability_of(agent.constraint, latent)
     return {
         "Value V": Field(values.mean(-1), "viridis"),
-        "Spread of V over members": Field(values.std(-1), "magma"),
+        "Spread of V over members": Field(values.std(-1, correction=_correction(values)), "magma"),
         "Safe set $f_S$": Field(safe, "BuGn", (0.0, 1.0), planner.safe_set_threshold),
         "Constraint $f_C$": Field(unsafe, "OrRd", (0.0, 1.0), planner.constraint_threshold),
         "Goal $f_G$": Field(probability_of(agent.goal, latent), "Blues", (0.0, 1.0), 0.5),
@@ -186,8 +199,39 @@ def plot_timelines(
                 grid(axis)
         axes[1, 0].set_ylabel("value V")
         axes[2, 0].set_ylabel("probability")
-        axes[2, 0].legend(loc="center left", fontsize=7)
         figure.tight_layout()
+        _legend(figure)
+
+
+def _legend(figure: Figure) -> None:
+    """What lines and bands mean, in one row below all panels, where it hides nothing."""
+    band = Patch(color=INK, alpha=0.15, lw=0, label="spread over members")
+    lines = (
+        ("mean value", INK, 1.4, "-"),
+        ("safe set $f_S$", SAFE, 1.4, "-"),
+        (r"threshold $\delta_S$", SAFE, 0.9, ":"),
+        ("constraint $f_C$", UNSAFE, 1.4, "-"),
+        (r"threshold $\delta_C$", UNSAFE, 0.9, ":"),
+        ("goal $f_G$", GOAL, 1.4, "-"),
+        ("goal first reached", GOAL, 1.0, "|"),
+        ("first violation", UNSAFE, 1.0, "|"),
+    )
+    handles: list[Artist] = [
+        Line2D(
+            [],
+            [],
+            color=colour,
+            lw=0 if style == "|" else width,
+            label=label,
+            ms=9,
+            mew=1.2,
+            ls="none" if style == "|" else style,
+            marker="|" if style == "|" else None,
+        )
+        for label, colour, width, style in lines
+    ]
+    handles.insert(1, band)
+    figure.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncol=len(handles), fontsize=7)
 
 
 def _plot_strip(axis: Axes, title: str, pixels: Tensor, frames: int = 7) -> None:
@@ -198,7 +242,8 @@ def _plot_strip(axis: Axes, title: str, pixels: Tensor, frames: int = 7) -> None
 
 
 def _plot_values(axis: Axes, values: Tensor) -> None:
-    time, middle, spread = np.arange(1, len(values) + 1), values.mean(-1).numpy(), values.std(-1).numpy()
+    time, middle = np.arange(1, len(values) + 1), values.mean(-1).numpy()
+    spread = values.std(-1, correction=_correction(values)).numpy()
     axis.plot(time, middle, color=INK, lw=1.4)
     axis.fill_between(time, middle - spread, middle + spread, color=INK, alpha=0.15, lw=0)
 

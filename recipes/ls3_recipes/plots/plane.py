@@ -63,6 +63,12 @@ def over_plane(env: VisualConstraintEnv, look: Callable[[Tensor], TensorDictBase
     return torch.cat([look(env.render_states(part)) for part in states.split(512)])
 
 
+def states_of(episodes: TensorDictBase | None, count: int) -> list[Tensor]:
+    """States ``[T, S]`` of the first episodes; none where there are no episodes, or none that keep states."""
+    shown = () if episodes is None else episodes[:count].unbind(0)
+    return [episode["state"] for episode in shown if episode.get("state", None) is not None]
+
+
 def maps(
     folder: Path, env: VisualConstraintEnv, fields: Mapping[str, Field], offline: Mapping[Tag, TensorDictBase]
 ) -> None:
@@ -72,9 +78,8 @@ def maps(
         for axis, (title, field) in zip(axes[0], fields.items(), strict=True):
             shown = _plot_field(axis, plane, field)
             for tag, colour in ((Tag.SUCCESS, SAFE), (Tag.CONSTRAINT, UNSAFE)):
-                if tag in offline:
-                    for track in offline[tag]["state"][:8]:
-                        axis.plot(*line(plane.positions(track)), color=colour, lw=0.5, alpha=0.6)
+                for track in states_of(offline.get(tag), 8):
+                    axis.plot(*line(plane.positions(track)), color=colour, lw=0.5, alpha=0.6)
             plot_outlines(axis, plane)
             axis.set_title(title)
             figure.colorbar(shown, ax=axis, shrink=0.7, pad=0.02)

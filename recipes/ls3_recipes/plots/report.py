@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ls3_recipes.plots.style import INK, Label, grid, picture
-from ls3_recipes.run_folder import read_metrics
+from ls3_recipes.run_folder import read_json, read_metrics
 
 #: How algorithms are shown, in the order of legend and table.
 Labels = Mapping[str, Label]
+#: In place of a figure that no run has.
+NOTHING = "–"
 #: Figures of an episode: name in the metrics, name in the summary, heading.
 FIGURES = (
     ("mean_success", "success_rate", "success"),
     ("mean_violation", "violation_rate", "violations"),
     ("mean_return", "return_mean", "return"),
 )
+
+
+_REMEDY = "Restore the file, or leave the run out."
 
 
 class Run(NamedTuple):
@@ -45,16 +49,42 @@ def read_run(folder: str | Path) -> Run:
     """Read a finished run.
 
     Raises:
-        FileNotFoundError: when the folder holds no ``summary.json``.
+        FileNotFoundError: when the folder holds no ``summary.json`` or ``metrics.csv``.
+        ValueError: for a file that is damaged.
     """
     folder = Path(folder)
-    if not (folder / "summary.json").is_file():
+    path = folder / "summary.json"
+    if not path.is_file():
         raise FileNotFoundError(f"{folder} is no folder of a finished run: summary.json is missing.")
-    summary = json.loads((folder / "summary.json").read_text())
+    summary = read_json(path)
+    _check_summary(summary, path)
     rows = [row for row in read_metrics(folder) if row["phase"] == "online"]
     curves = {name: np.array([float(r["value"]) for r in rows if r["name"] == name]) for name, _, _ in FIGURES}
-    episodes = np.array([int(r["step"]) for r in rows if r["name"] == FIGURES[0][0]])
+    episodes = np.array([int(r["step"]) for r in rows if r["name"] == FIGURES[0][0]], dtype=int)
+    if {len(curve) for curve in curves.values()} != {len(episodes)}:
+        raise ValueError(
+            f"{folder / 'metrics.csv'} is damaged: its online episodes do not have all of {', '.join(curves)}. "
+            f"{_REMEDY}"
+        )
     return Run(summary.get("algorithm", "ls3"), summary["seed"], summary, episodes, curves)
+
+
+def _check_summary(summary: Mapping[str, Any], path: Path) -> None:
+    """Refuse a summary that lacks what a report shows."""
+
+    def require(there: bool, what: str) -> None:
+        if not there:
+            raise ValueError(f"{path} is damaged: it lacks {what}. {_REMEDY}")
+
+    require(isinstance(summary.get("task"), str), "the name of a task")
+    require(isinstance(summary.get("algorithm", "ls3"), str), "the name of an algorithm")
+    require(type(summary.get("seed")) is int, "a seed")
+    for part in ("demonstrations", "online", "evaluation"):
+        if part in summary:
+            for _, name, _ in FIGURES:
+                figures = summary[part]
+                there = isinstance(figures, Mapping) and type(figures.get(name)) in (int, float)
+                require(there, f"the number {part}.{name}")
 
 
 def check_alike(runs: Sequence[Run]) -> None:
@@ -107,21 +137,26 @@ def rows_of(runs: Sequence[Run], labels: Labels) -> list[dict[str, str]]:
         for part in ("online", "evaluation"):
             for _, figure, heading in FIGURES:
                 values = [run.summary[part][figure] for run in group if part in run.summary]
-                mean, error = mean_and_error(np.array(values)) if values else (np.nan, np.nan)
                 rate = figure.endswith("rate")
-                row[f"{part} {heading}"] = (
-                    f"{100 * mean:.0f} ± {100 * error:.0f} %" if rate else f"{mean:.1f} ± {error:.1f}"
-                )
-        total = np.array([run.curves["mean_violation"].sum() * np.diff(run.episodes, prepend=0)[0] for run in group])
-        mean, error = mean_and_error(total)
-        row["violating episodes"] = f"{mean:.1f} ± {error:.1f}"
+                shown = _shown(*mean_and_error(np.array(values)), rate=rate) if values else NOTHING
+                row[f"{part} {heading}"] = shown
+        total = np.array([(run.curves["mean_violation"] * np.diff(run.episodes, prepend=0)).sum() for run in group])
+        row["violating episodes"] = _shown(*mean_and_error(total)) if len(group[0].episodes) else NOTHING
         rows.append(row)
     return rows
 
 
+def _shown(mean: Any, error: Any, *, rate: bool = False) -> str:
+    """A mean and its error, in per cent where it is a rate; nothing where it is no number."""
+    if not np.isfinite(mean):
+        return NOTHING
+    return f"{100 * mean:.0f} ± {100 * error:.0f} %" if rate else f"{mean:.1f} ± {error:.1f}"
+
+
 def plot_report(runs: Sequence[Run], labels: Labels, path: Path) -> None:
     """The figures against online episodes: means over seeds, with bands of one standard error."""
-    demonstrated = np.mean([run.summary["demonstrations"]["return_mean"] for run in runs])
+    returns = [run.summary["demonstrations"]["return_mean"] for run in runs if "demonstrations" in run.summary]
+    demonstrated = np.mean(returns) if returns else np.nan
     with picture(path, 1, 4, (15, 3.3)) as (figure, (axes,)):
         for name, group in grouped(runs, labels).items():
             episodes, label = group[0].episodes, label_of(name, labels)
@@ -129,14 +164,18 @@ def plot_report(runs: Sequence[Run], labels: Labels, path: Path) -> None:
             violating = np.cumsum(panels[1] * np.diff(episodes, prepend=0), axis=1)
             for axis, values in zip(axes, [*panels, violating], strict=True):
                 mean, error = mean_and_error(values)
-                axis.plot(episodes, mean, color=label.colour, lw=2.4 if name == "ls3" else 1.5, label=label.title)
+                width, marker = 2.4 if name == "ls3" else 1.5, "o" if len(episodes) == 1 else None
+                axis.plot(episodes, mean, color=label.colour, lw=width, marker=marker, label=label.title)
                 axis.fill_between(episodes, mean - error, mean + error, color=label.colour, alpha=0.15, lw=0)
         for axis, title in zip(axes, ("Success rate", "Violation rate", "Return", "Violating episodes"), strict=True):
             axis.set(title=title, xlabel="online episodes")
             grid(axis)
         axes[0].set_ylim(-0.03, 1.03)
         axes[1].set_ylim(-0.03, 1.03)
-        axes[2].axhline(demonstrated, color=INK, lw=0.9, ls=":")
-        axes[2].annotate("demonstrator", (axes[2].get_xlim()[1], demonstrated), ha="right", va="bottom", fontsize=7)
+        if np.isfinite(demonstrated):
+            axes[2].axhline(demonstrated, color=INK, lw=0.9, ls=":")
+            axes[2].annotate("demonstrator", (axes[2].get_xlim()[1], demonstrated), ha="right", va="bottom", fontsize=7)
+        if not len(runs[0].episodes):
+            axes[0].annotate("no online episodes", (0.5, 0.5), xycoords="axes fraction", ha="center", fontsize=8)
         axes[0].legend(fontsize=7, loc="lower right")
         figure.tight_layout()

@@ -7,14 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image, ImageDraw
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from ls3_envs import VisualConstraintEnv
-from ls3_recipes.plots.plane import plane_of, plot_outlines, the_plane
-from ls3_recipes.plots.style import INK, PALE, SAFE, UNSAFE, grid, image, line, picture, plt
+from ls3_recipes.plots.plane import plane_of, plot_outlines, states_of, the_plane
+from ls3_recipes.plots.style import INK, PALE, SAFE, UNSAFE, Pictures, grid, image, line, picture, plt
 from ls3_recipes.run_folder import read_metrics
 from ls3_recipes.run_settings import TaskSettings
 from ls3_torchrl.data import Tag
@@ -23,30 +22,31 @@ from ls3_torchrl.data import Tag
 Series = dict[tuple[str, str], list[tuple[float, float]]]
 
 
-@torch.no_grad()
-def plot_run(
+def pictures_of_run(
     folder: Path,
     task: TaskSettings,
     offline: Mapping[Tag, TensorDictBase],
     tracks: Sequence[Tensor],
     evaluation: TensorDictBase,
-) -> None:
-    """The pictures that a run of any algorithm leaves, into its folder.
+) -> Pictures:
+    """The pictures that a run of any algorithm leaves in its folder.
 
     Args:
         folder: the run's folder.
         task: what was learnt.
-        offline: the demonstrations by tag.
+        offline: the demonstrations by tag; those without states are left out where paths are shown.
         tracks: states ``[N, T, S]`` of the online episodes, one entry an update.
         evaluation: the evaluation episodes ``[N, T]``.
     """
-    series = read_series(folder)
-    plot_learning_curves(folder, series)
-    plot_losses(folder, series)
-    save_video(folder / "evaluation.gif", evaluation)
+    pictures: Pictures = {
+        "learning_curves.png": lambda: plot_learning_curves(folder, read_series(folder)),
+        "losses.png": lambda: plot_losses(folder, read_series(folder)),
+        "evaluation.gif": lambda: save_video(folder / "evaluation.gif", evaluation),
+    }
     env = plane_of(task)
     if env is not None:
-        plot_paths(folder, env, offline, tracks, evaluation)
+        pictures["paths.png"] = lambda: plot_paths(folder, env, offline, tracks, evaluation)
+    return pictures
 
 
 def read_series(folder: Path) -> Series:
@@ -81,7 +81,7 @@ def plot_losses(folder: Path, series: Series) -> None:
         for axis, ((phase, name), points) in zip(axes.flat, losses.items(), strict=False):
             x, y = np.array(points).T
             axis.plot(x, y, lw=1.2, color=INK)
-            if (y > 0).all():
+            if (y[np.isfinite(y)] > 0).all() and np.isfinite(y).any():
                 axis.set_yscale("log")
             axis.set_title(phase if of_phase[phase] == 1 else f"{phase}: {name.removeprefix('loss_')}")
             grid(axis)
@@ -102,7 +102,7 @@ def plot_paths(
         for axis, title in zip((shown, learning, now), titles, strict=True):
             plot_outlines(axis, plane)
             axis.set_title(title)
-        for track in offline[Tag.SUCCESS]["state"][:20]:
+        for track in states_of(offline.get(Tag.SUCCESS), 20):
             shown.plot(*line(plane.positions(track)), color=SAFE, lw=0.6, alpha=0.6)
         colours = plt.get_cmap("viridis")(np.linspace(0.9, 0.1, max(len(tracks), 1)))
         for colour, update in zip(colours, tracks, strict=False):

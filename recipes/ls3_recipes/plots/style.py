@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +15,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from torch import Tensor
+
+from ls3_recipes.console import console
 
 INK, SAFE, UNSAFE, PALE, GOAL = "#22303c", "#1b7f79", "#d1495b", "#b8c4cc", "#e0a458"
 STYLE: Any = {
@@ -33,6 +35,29 @@ STYLE: Any = {
 }
 
 
+#: What draws pictures, by the names of their files.
+Pictures = dict[str, Callable[[], None]]
+
+
+def draw(pictures: Pictures) -> dict[str, str]:
+    """Draw pictures one by one; one that fails costs nothing but itself, and is told.
+
+    Args:
+        pictures: what draws them, by the names of their files.
+
+    Returns:
+        The reasons why pictures failed, by the same names.
+    """
+    failed = {}
+    for name, plot in pictures.items():
+        try:
+            plot()
+        except Exception as error:  # whatever it is: the results are there already
+            failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            console.print(f"{name} was not drawn: {failed[name]}", markup=False)
+    return failed
+
+
 class Label(NamedTuple):
     """How pictures of several runs show an algorithm: the name that people know it by, and the colour of its curves."""
 
@@ -45,9 +70,11 @@ def picture(path: Path, rows: int, columns: int, size: tuple[float, float], **op
     """A figure with a grid of axes ``[rows, columns]``, saved when the block is left."""
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, **options)
-        yield figure, axes
-        figure.savefig(path)
-        plt.close(figure)
+        try:
+            yield figure, axes
+            figure.savefig(path)
+        finally:
+            plt.close(figure)
 
 
 def grid(axis: Axes) -> None:

@@ -106,7 +106,7 @@ def test_the_gallerys_help(capsys):
         (["train", "preset=smoke", "data=nowhere"], "ls3 train: "),
         (["evaluate", "run=nowhere"], "ls3 evaluate: nowhere is no run folder"),
         (["report", "runs=nowhere"], "ls3 report: nowhere "),
-        (["train", "preset=fast", "--help"], "ls3 train: In 'train': Could not find 'preset/fast'"),
+        (["train", "preset=fast", "--help"], "ls3 train: preset must be one of cpu, paper, smoke; got 'fast'."),
         (["collect", "planner.horizon=9"], "ls3 collect: planner.horizon=9: ls3 collect has no planner."),
     ],
 )
@@ -159,9 +159,8 @@ def test_errors_after_the_folder_was_made_keep_their_trace(own_preset, monkeypat
     train = importlib.import_module("ls3_recipes.commands.train")
     monkeypatch.setattr(train, "run_experiment", fail)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    with pytest.raises(SystemExit) as stopped:
+    with pytest.raises(ValueError, match="late"):
         main(["train", "output=made"])
-    assert stopped.value.code == 1  # Hydra's, which has printed the trace
 
 
 @pytest.mark.slow

@@ -1,0 +1,54 @@
+"""What Hydra makes of YAML files and arguments, and what it says when it cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import DictConfig, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from ls3_recipes.overrides import CONF
+from ls3_recipes.run_folder import read_yaml
+
+
+def composed(command: str, overrides: Sequence[str], folder: str | None = None) -> DictConfig:
+    """What Hydra makes of a command's file and arguments.
+
+    Args:
+        command: its name, and that of its file in ``conf/``.
+        overrides: arguments, with present names.
+        folder: of a user's own files.
+
+    Raises:
+        ValueError: for files and arguments that it cannot make anything of.
+    """
+    searched = []
+    if folder is not None:
+        if not Path(folder).is_dir():
+            raise ValueError(f"--config-dir must name a folder with YAML files; there is none at {folder!r}.")
+        searched = [f"hydra.searchpath=['file://{Path(folder).absolute()}']"]
+    try:
+        # A command that asks for another one's settings may have Hydra already.
+        with nullcontext() if GlobalHydra().is_initialized() else initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose(command, [*overrides, *searched], return_hydra_config=True)
+        HydraConfig.instance().set_config(config)  # for those that a user's file refers to
+        with open_dict(config):
+            del config["hydra"]
+    except (HydraException, OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError) as error:
+        for path in sorted(Path(folder).rglob("*.y*ml")) if folder else ():
+            read_yaml(path)  # names the file, where it is one of these
+        raise ValueError(f"These settings make no configuration: {reason(error)}") from error
+    return config
+
+
+def reason(error: Exception) -> str:
+    """What Hydra or OmegaConf say, on one line and without what only its own users know."""
+    lines = [line.strip() for line in str(error.__cause__ or error).splitlines()]
+    return " ".join(line for line in lines if line and not line.startswith(("Config search path", "provider=")))
