@@ -6,6 +6,7 @@ import inspect
 import operator
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
+from functools import partial
 from typing import Any
 
 import torch
@@ -54,18 +55,23 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f" Did you mean {close[0]!r}?" if close else ""
 
 
-def check_options(call: Callable[..., Any], options: Iterable[str]) -> None:
-    """Raise ``TypeError`` for options that ``call`` does not take, naming those that it does."""
+def parameters_of(call: Callable[..., Any]) -> dict[str, inspect.Parameter] | None:
+    """What a class or function takes, by name; ``None`` for what does not say it, being written in C."""
+    if isinstance(call, partial):
+        inner = parameters_of(call.func)
+        given = {} if inner is None else {name: call.keywords[name] for name in inner if name in call.keywords}
+        return inner and inner | {name: inner[name].replace(default=value) for name, value in given.items()}
     try:
-        parameters = inspect.signature(call).parameters.values()
+        # Of a class its own __init__: TorchRL's environments have a metaclass that takes anything and passes it on.
+        found = inspect.signature(call.__init__ if isinstance(call, type) else call).parameters  # type: ignore[misc]
     except (TypeError, ValueError):
-        return  # what is written in C says nothing of itself; it answers when it is called
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-        return
-    known = [parameter.name for parameter in parameters if parameter.kind is not parameter.POSITIONAL_ONLY]
+        return None
+    return {name: parameter for name, parameter in found.items() if name != "self"}
+
+
+def explain_options(error: TypeError, call: Callable[..., Any], options: Iterable[str]) -> None:
+    """Raise Python's ``error`` about an option that ``call`` does not take anew, with those that it does."""
+    known = list(parameters_of(call) or ())
     for option in options:
-        if option not in known:
-            raise TypeError(
-                f"{getattr(call, '__name__', call)!s} has no option {option!r}; it has: {', '.join(known)}."
-                f"{nearest(option, known)}"
-            )
+        if known and option not in known and f"unexpected keyword argument {option!r}" in str(error):
+            raise TypeError(f"{error}. It has: {', '.join(known)}.{nearest(option, known)}") from None

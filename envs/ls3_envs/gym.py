@@ -67,8 +67,8 @@ class _Batch:
         self.seen = self.env.reset(request)
         return _images(self.seen["pixels"])
 
-    def checked(self, action: Any, shape: tuple[int, ...]) -> np.ndarray:
-        """The action in float32; an error in Gymnasium's terms for another shape, type or range."""
+    def checked(self, action: Any, shape: tuple[int, ...], unused: np.ndarray | None = None) -> np.ndarray:
+        """The action in float32, 0 in unused rows; an error in Gymnasium's terms for another shape, type or range."""
         try:
             found = np.asarray(action)
         except Exception as error:
@@ -79,6 +79,8 @@ class _Batch:
             raise ValueError(f"An action must have shape {shape}, got {found.shape}.")
         with np.errstate(over="ignore"):
             own = found.astype(np.float32)
+        if unused is not None:
+            own[unused] = 0.0
         excess = (np.abs(own) - 1.0) * self._side / 2.0
         if not (excess <= ACTION_TOLERANCE).all():  # also catches NaN
             raise ValueError(
@@ -322,10 +324,7 @@ class GymVectorEnv(VectorEnv):
                 f"The environments {anew.nonzero()[0].tolist()} have ended, and autoreset is disabled. "
                 "Call reset(options={'reset_mask': terminated | truncated}) first."
             )
-        if np.ndim(actions) == 2 and len(actions) == self.num_envs and anew.any():
-            actions = np.array(actions)
-            actions[anew] = 0  # not used, whatever it is
-        actions = self._batch.checked(actions, self.action_space.shape)
+        actions = self._batch.checked(actions, self.action_space.shape, unused=anew)
         everybody = np.ones(self.num_envs, dtype=bool)
         if anew.all():
             nothing = np.zeros(self.num_envs, dtype=bool)

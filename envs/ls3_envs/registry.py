@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import multiprocessing
 import re
 from collections.abc import Callable, Mapping
@@ -17,7 +16,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import CatFrames, Compose, InitTracker, Transform, TransformedEnv, UnaryTransform
 
-from ls3_envs._checks import check_options, nearest, usable_device, whole_number
+from ls3_envs._checks import explain_options, nearest, parameters_of, usable_device, whole_number
 from ls3_envs.base import VisualConstraintEnv
 from ls3_envs.demonstrators.scripted import Scripted, collect_episodes
 from ls3_envs.lazy import Lazy
@@ -102,10 +101,7 @@ class Domain:
         """Steps of an episode when no other number is asked for, as far as it is known without importing anything."""
         if self.horizon is not None or isinstance(self.env, Lazy):
             return self.horizon
-        try:
-            own = inspect.signature(self.env).parameters.get("horizon")
-        except (TypeError, ValueError):
-            return None
+        own = (parameters_of(self.env) or {}).get("horizon")
         if own is None or own.default is own.empty or own.default is None:
             return None
         return whole_number(own.default, f"horizon of {getattr(self.env, '__name__', self.env)!s}", unit=" step")
@@ -302,8 +298,12 @@ def make(
     stride = row.frame_stride if frame_stride is None else frame_stride
     _check_frames(frames, stride)
     build = row.env.load() if isinstance(row.env, Lazy) else row.env
-    check_options(build, options)
-    return TransformedEnv(build(num_envs=num_envs, **options), Compose(*_stack(frames, stride), InitTracker()))
+    try:
+        env = build(num_envs=num_envs, **options)
+    except TypeError as error:
+        explain_options(error, build, options)
+        raise
+    return TransformedEnv(env, Compose(*_stack(frames, stride), InitTracker()))
 
 
 def collect_offline(

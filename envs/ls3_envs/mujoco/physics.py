@@ -40,7 +40,7 @@ _LEFT_BEHIND: list[Rollout | None] = []
 
 
 def _leave_threads_behind() -> None:
-    """After a fork: threads did not come along, and their pool, even when it is deleted, would wait for them for ever."""
+    """After a fork: threads did not come along, and their pool would wait for them for ever, even to be deleted."""
     for physics in _WITH_THREADS:
         _LEFT_BEHIND.append(physics._rollout)
         physics._rollout = None
