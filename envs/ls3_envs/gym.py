@@ -67,8 +67,9 @@ class _Batch:
         self.seen = self.env.reset(request)
         return _images(self.seen["pixels"])
 
-    def checked(self, action: Any, shape: tuple[int, ...], unused: np.ndarray | None = None) -> np.ndarray:
+    def checked(self, action: Any, *lead: int, unused: np.ndarray | None = None) -> np.ndarray:
         """The action in float32, 0 in unused rows; an error in Gymnasium's terms for another shape, type or range."""
+        shape = (*lead, *self._low.shape)
         try:
             found = np.asarray(action)
         except Exception as error:
@@ -186,7 +187,7 @@ class GymEnv(gymnasium.Env):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Act."""
         self._batch.check_started("step")
-        out = self._batch.step(self._batch.checked(action, self.action_space.shape)[None])
+        out = self._batch.step(self._batch.checked(action)[None])
         self._steps += 1
         reward, truncated = float(out["reward"]), bool(out["truncated"])
         return _images(out["pixels"])[0], reward, bool(out["terminated"]), truncated, self._info()
@@ -324,7 +325,7 @@ class GymVectorEnv(VectorEnv):
                 f"The environments {anew.nonzero()[0].tolist()} have ended, and autoreset is disabled. "
                 "Call reset(options={'reset_mask': terminated | truncated}) first."
             )
-        actions = self._batch.checked(actions, self.action_space.shape, unused=anew)
+        actions = self._batch.checked(actions, self.num_envs, unused=anew)
         everybody = np.ones(self.num_envs, dtype=bool)
         if anew.all():
             nothing = np.zeros(self.num_envs, dtype=bool)
