@@ -61,7 +61,9 @@ def _algorithm_in(overrides: Iterable[str]) -> str:
 def _missing(values: Any, where: str = "") -> list[str]:
     """The settings without a value, with their sections."""
     if isinstance(values, Mapping):
-        return [name for key, value in values.items() for name in _missing(value, f"{where}.{key}" if where else str(key))]
+        return [
+            name for key, value in values.items() for name in _missing(value, f"{where}.{key}" if where else str(key))
+        ]
     return [where] if values == MISSING else []
 
 
@@ -93,6 +95,10 @@ def settings_from(
         raise ValueError(f"These settings make no configuration: {reason(error)}") from error
     named = rename_settings(_named(values), renamed, explicit={name_in(override) for override in overrides})
     built = build(settings, prune(named, settings))
+    if isinstance(built, RunSettings) and settings_class_of([f"algorithm={built.algorithm}"]) is not settings:
+        raise ValueError(
+            f"algorithm={built.algorithm} stands in a file, where it chooses nothing. Give it as an argument."
+        )
     refuse_unread(overrides, built)
     return built
 
