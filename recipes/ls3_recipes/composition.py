@@ -14,7 +14,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from ls3_recipes.overrides import CONF
+from ls3_recipes.arguments import name_in
+from ls3_recipes.overrides import CONF, GROUPS, parse
 from ls3_recipes.run_folder import read_yaml
 
 
@@ -29,7 +30,10 @@ def composed(command: str, overrides: Sequence[str], folder: str | None = None) 
     Raises:
         ValueError: for files and arguments that it cannot make anything of.
     """
-    searched = []
+    # Hydra takes what is called like a folder of files for a choice of one, though the command has none.
+    folders = {path.name for path in CONF.iterdir() if path.is_dir()} - {*GROUPS.get(command, ())}
+    own = [override for override in overrides if name_in(override) in folders]
+    known, searched = [override for override in overrides if override not in own], []
     if folder is not None:
         if not Path(folder).is_dir():
             raise ValueError(f"--config-dir must name a folder with YAML files; there is none at {folder!r}.")
@@ -37,10 +41,12 @@ def composed(command: str, overrides: Sequence[str], folder: str | None = None) 
     try:
         # A command that asks for another one's settings may have Hydra already.
         with nullcontext() if GlobalHydra().is_initialized() else initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose(command, [*overrides, *searched], return_hydra_config=True)
+            config = compose(command, [*known, *searched], return_hydra_config=True)
         HydraConfig.instance().set_config(config)  # for those that a user's file refers to
         with open_dict(config):
             del config["hydra"]
+            for override in parse(own):
+                config[override.key_or_group] = override.value()
     except (HydraException, OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError) as error:
         for path in sorted(Path(folder).rglob("*.y*ml")) if folder else ():
             read_yaml(path)  # names the file, where it is one of these

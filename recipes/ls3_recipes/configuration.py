@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import hydra
 from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ls3_recipes.algorithms import ALGORITHMS
@@ -19,7 +19,7 @@ from ls3_recipes.arguments import config_dir, name_in, split_arguments
 from ls3_recipes.composition import composed, reason
 from ls3_recipes.console import command_line
 from ls3_recipes.options import build, defaults
-from ls3_recipes.overrides import CONF, check, choices_of
+from ls3_recipes.overrides import CONF, GROUPS, check, choices_of
 from ls3_recipes.relevance import prune, refuse_irrelevant, refuse_unread
 from ls3_recipes.renamed import RENAMED, on_command_line, rename_overrides, rename_settings
 from ls3_recipes.run_folder import read_yaml
@@ -27,8 +27,6 @@ from ls3_recipes.run_settings import RunSettings
 from ls3_recipes.typed import did_you_mean
 
 S = TypeVar("S")
-#: Folders of ``conf/`` whose files can be chosen, by command.
-GROUPS = {"train": ("algorithm", "task", "preset", "tuned"), "collect": ("task",)}
 _HEADING = "All settings, with the values that these arguments give"
 
 
@@ -60,6 +58,15 @@ def _algorithm_in(overrides: Iterable[str]) -> str:
     return chosen[-1].strip("'\"") if chosen else "ls3"
 
 
+def _missing(values: Any, where: str = "") -> list[str]:
+    """The settings without a value, with their sections."""
+    if isinstance(values, Mapping):
+        return [
+            name for key, value in values.items() for name in _missing(value, f"{where}.{key}" if where else str(key))
+        ]
+    return [where] if values == MISSING else []
+
+
 def _named(values: Any) -> dict[str, Any]:
     assert isinstance(values, dict)
     return {str(key): value for key, value in values.items()}
@@ -83,11 +90,15 @@ def settings_from(
     try:
         values = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:
-        if missing := sorted(OmegaConf.missing_keys(config)):
+        if missing := _missing(OmegaConf.to_container(config, resolve=False)):
             raise ValueError(f"{missing[0]} must be given: it has no default.") from None
         raise ValueError(f"These settings make no configuration: {reason(error)}") from error
     named = rename_settings(_named(values), renamed, explicit={name_in(override) for override in overrides})
     built = build(settings, prune(named, settings))
+    if isinstance(built, RunSettings) and settings_class_of([f"algorithm={built.algorithm}"]) is not settings:
+        raise ValueError(
+            f"algorithm={built.algorithm} stands in a file, where it chooses nothing. Give it as an argument."
+        )
     refuse_unread(overrides, built)
     return built
 

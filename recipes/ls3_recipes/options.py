@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from typing import Any, TypeVar, get_type_hints
 
 from omegaconf import MISSING
@@ -80,7 +81,8 @@ def _hints(sources: Iterable[Callable[..., Any]]) -> dict[str, Any]:
     return out
 
 
-def sections(settings: type) -> dict[str, type]:
+@cache
+def sections(settings: Any) -> dict[str, type]:
     """The fields of a dataclass that are dataclasses themselves, by name."""
     hints = get_type_hints(settings)
     names = [field.name for field in dataclasses.fields(settings)]

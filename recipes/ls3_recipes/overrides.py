@@ -14,6 +14,8 @@ from ls3_recipes.options import defaults, leaves, unknown
 from ls3_recipes.typed import did_you_mean
 
 CONF = Path(__file__).parent / "conf"
+#: Folders of ``conf/`` whose files can be chosen, by command.
+GROUPS = {"train": ("algorithm", "task", "preset", "tuned"), "collect": ("task",)}
 
 
 def parse(overrides: Iterable[str]) -> list[Override]:

@@ -21,7 +21,7 @@ from ls3_recipes.rollout import collect_demonstrations, make_env, run_episodes, 
 from ls3_recipes.run_folder import RunFolder, require_new
 from ls3_recipes.run_settings import RunSettings
 from ls3_recipes.together import require_room, require_tools
-from ls3_torchrl.data import Tag, load_episodes, save_episodes
+from ls3_torchrl.data import Tag, check_datasets, load_episodes, save_episodes
 from ls3_torchrl.trainers.learner import log_scalars
 from ls3_torchrl.trainers.progress import progress_bar
 
@@ -95,6 +95,10 @@ class Experiment:
                     f"{self.settings.data} has no {tag.name.lower()} episodes, which {self.algorithm.name} needs. "
                     "Collect them first."
                 )
+        try:
+            check_datasets(offline, action_spec=self.env.action_spec)
+        except (ValueError, TypeError, KeyError) as error:
+            raise type(error)(f"data={self.settings.data}: {error}") from error
         return offline
 
     @contextmanager

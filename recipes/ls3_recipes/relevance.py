@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any
 
 from ls3_recipes.algorithms import ALGORITHMS
@@ -11,6 +12,7 @@ from ls3_recipes.options import defaults
 from ls3_recipes.run_settings import RunSettings
 
 
+@cache
 def _known_anywhere() -> dict[str, Any]:
     """The settings of all algorithms together: what a preset or a task may hold."""
     known: dict[str, Any] = {}

@@ -102,7 +102,10 @@ def plot_paths(
         for axis, title in zip((shown, learning, now), titles, strict=True):
             plot_outlines(axis, plane)
             axis.set_title(title)
-        for track in states_of(offline.get(Tag.SUCCESS), 20):
+        tracks_shown = states_of(offline.get(Tag.SUCCESS), 20)
+        if not tracks_shown:
+            shown.set_title(f"{titles[0]} (without states)")
+        for track in tracks_shown:
             shown.plot(*line(plane.positions(track)), color=SAFE, lw=0.6, alpha=0.6)
         colours = plt.get_cmap("viridis")(np.linspace(0.9, 0.1, max(len(tracks), 1)))
         for colour, update in zip(colours, tracks, strict=False):

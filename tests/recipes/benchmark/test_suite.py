@@ -123,3 +123,7 @@ def test_the_former_name_of_the_reference_is_read(monkeypatch, capfd, tmp_path):
     command.main(["plain=false", "seconds=1", f"output={tmp_path / 'new'}"])
     assert capfd.readouterr().err == "ls3 benchmark: plain is now reference\n"
     assert [(settings.reference, settings.seconds) for settings in seen] == [(False, 1)]
+
+
+def test_the_task_can_be_chosen_although_hydra_has_a_folder_of_that_name():
+    assert compose_settings("benchmark", BenchmarkSettings, ["task=reacher"]).task == "reacher"
