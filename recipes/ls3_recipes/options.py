@@ -135,7 +135,7 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
     prefix = f"{where}." if where else ""
     for key in values:
         if key not in names:
-            raise ValueError(unknown(key, names, where, [prefix + name for name in leaves(settings)]))
+            raise ValueError(unknown(key, names, where, [prefix + name for name in leaves(settings)]))  # type: ignore[arg-type]
     arguments: dict[str, Any] = {}
     for key, value in values.items():
         if key in nested:

@@ -144,7 +144,10 @@ MISTAKES = {
         (("report",), "No runs: pass runs=[DIR,DIR,...]"),
         (("report", "runs=[nowhere]"), "nowhere is no folder of a finished run: summary.json is missing."),
         (("collect", "output=a_file/data"), "output=a_file/data cannot be made: "),
-        (("benchmark", "agent=nowhere.pt"), "There is no agent at nowhere.pt."),
+        (
+            ("benchmark", "agent=nowhere.pt"),
+            "nowhere.pt is not an agent file (ls3_torchrl.agent): there is no such file. Check the path.",
+        ),
         (("benchmark", "output=a_file/b"), "output=a_file/b cannot be made: "),
         (
             ("train", "--config-dir", "nowhere"),
