@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import re
 from pathlib import Path
 
 import torch
+
+from ls3_envs.cores import available_cores
 
 
 def choose_device(name: str) -> torch.device:
@@ -41,4 +42,4 @@ def hardware(device: torch.device) -> dict[str, str | int]:
         models = [line for line in lines if line.startswith("model name")]
         name = models[0].split(":", 1)[1].strip() if models else name
     gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else "none"
-    return {"cpu": name, "cores": os.cpu_count() or 0, "threads": torch.get_num_threads(), "gpu": gpu}
+    return {"cpu": name, "cores": available_cores(), "threads": torch.get_num_threads(), "gpu": gpu}

@@ -129,13 +129,13 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
         ...
         ValueError: flight has no setting sped: did you mean flight.speed? It has: speed.
     """
-    nested, hints = sections(settings), get_type_hints(settings)
+    nested, hints = sections(settings), get_type_hints(settings)  # type: ignore[arg-type]
     fields = dataclasses.fields(settings)  # type: ignore[arg-type]
     names = [field.name for field in fields]
     prefix = f"{where}." if where else ""
     for key in values:
         if key not in names:
-            raise ValueError(unknown(key, names, where, [prefix + name for name in leaves(settings)]))  # type: ignore[arg-type]
+            raise ValueError(unknown(key, names, where, [prefix + name for name in leaves(settings)]))
     arguments: dict[str, Any] = {}
     for key, value in values.items():
         if key in nested:

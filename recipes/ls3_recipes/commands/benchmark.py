@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+import ls3_envs  # noqa: F401  (before TorchRL, which imports MuJoCo: whatever MUJOCO_GL says)
 from ls3_recipes.benchmark.suite import BenchmarkSettings, run_benchmark
 from ls3_recipes.configuration import register, run_command
 from ls3_recipes.renamed import RENAMED_OF_BENCHMARK

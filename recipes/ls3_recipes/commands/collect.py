@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import ls3_envs  # noqa: F401  (before TorchRL, which imports MuJoCo: whatever MUJOCO_GL says)
 from ls3_recipes.configuration import register, run_command
 from ls3_recipes.console import console, percent_of
 from ls3_recipes.figures import episode_figures, summarise

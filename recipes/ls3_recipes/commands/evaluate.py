@@ -10,6 +10,7 @@ from typing import Any, get_type_hints
 
 import torch
 
+import ls3_envs  # noqa: F401  (before TorchRL, which imports MuJoCo: whatever MUJOCO_GL says)
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.algorithms.ls3 import LS3Settings, PlannerSettings
 from ls3_recipes.configuration import register, run_command, settings_of_run

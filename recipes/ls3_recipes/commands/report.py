@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from rich.table import Table
 
+import ls3_envs  # noqa: F401  (before TorchRL, which imports MuJoCo: whatever MUJOCO_GL says)
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.configuration import register, run_command
 from ls3_recipes.console import console

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+import ls3_envs  # noqa: F401  (before TorchRL, which imports MuJoCo: whatever MUJOCO_GL says)
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.configuration import run_command, settings_class_of
 from ls3_recipes.overrides import choices_of

@@ -1,6 +1,7 @@
 """The command ``ls3``: its commands, its help, and what it says when it cannot go on."""
 
 import importlib
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -35,6 +36,16 @@ def test_every_command_is_a_file_with_an_entry_point_and_a_door(name):
         assert f"from ls3_recipes.commands.{name} import main" in source
         assert len(source.splitlines()) < 10
     assert {path.stem for path in Path(commands.__file__).parent.glob("[a-z]*.py")} == set(COMMANDS)
+
+
+@pytest.mark.parametrize("backend", ["osmesa", "nonsense"])
+def test_a_backend_of_opengl_that_does_not_work_keeps_no_command_from_starting(backend):
+    command = [sys.executable, "-m", "ls3_recipes", "train", "seed=abc"]
+    where = os.pathsep.join(str(RECIPES.parent / part) for part in ("", "envs", "recipes"))
+    environment = os.environ | {"MUJOCO_GL": backend, "PYTHONPATH": where}
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert run.stderr.strip().splitlines()[-1] == "ls3 train: seed must be a whole number, got 'abc'."
+    assert run.returncode == 1
 
 
 @pytest.mark.parametrize("missing", ["hydra", "mujoco", "matplotlib.pyplot"])
