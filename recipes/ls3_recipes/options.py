@@ -129,7 +129,7 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
         ...
         ValueError: flight has no setting sped: did you mean flight.speed? It has: speed.
     """
-    nested, hints = sections(settings), get_type_hints(settings)
+    nested, hints = sections(settings), get_type_hints(settings)  # type: ignore[arg-type]
     fields = dataclasses.fields(settings)  # type: ignore[arg-type]
     names = [field.name for field in fields]
     prefix = f"{where}." if where else ""
