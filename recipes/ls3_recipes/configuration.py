@@ -116,7 +116,7 @@ def settings_of_run(folder: str | Path) -> RunSettings:
     if not path.is_file():
         raise FileNotFoundError(f"{folder} is no run folder: config.yaml is missing. Pass run=DIR of a finished run.")
     renamed = rename_settings({"algorithm": "ls3"} | read_yaml(path))
-    if renamed["algorithm"] not in ALGORITHMS:
+    if renamed["algorithm"] not in [*ALGORITHMS]:  # whatever stands there
         raise ValueError(f"{path}: algorithm must be one of {', '.join(ALGORITHMS)}; got {renamed['algorithm']!r}.")
     vae = renamed.get("vae")
     if isinstance(vae, dict) and isinstance(vae.get("checkpoint"), str) and not Path(vae["checkpoint"]).is_file():
