@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from ls3_torchrl.trainers import LossOptions, LS3Options, OfflineOptions, OnlineOptions, OptimOptions, VAEOptions
@@ -51,6 +52,62 @@ from ls3_torchrl.trainers import LossOptions, LS3Options, OfflineOptions, Online
 def test_values_out_of_range_are_refused_by_name(options, field, value):
     with pytest.raises(ValueError, match=rf"^{field} must"):
         options(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("options", "field", "value"),
+    [
+        (VAEOptions, "steps", 1.5),
+        (VAEOptions, "steps", "ten"),
+        (VAEOptions, "steps", True),
+        (VAEOptions, "threads", "all"),
+        (VAEOptions, "lr", "fast"),
+        (VAEOptions, "lr", None),
+        (VAEOptions, "beta", "small"),
+        (VAEOptions, "unit_scale", "maybe"),
+        (VAEOptions, "crop_scale", 0.8),
+        (VAEOptions, "warmup", "early"),
+        (VAEOptions, "warmup", ["a", "b"]),
+        (VAEOptions, "checkpoint", 3),
+        (OfflineOptions, "dynamics_steps", 1.5),
+        (OnlineOptions, "classifier_steps", "many"),
+        (OnlineOptions, "fraction", "half"),
+        (OptimOptions, "bootstrap", 1),
+        (OptimOptions, "cooldown", "late"),
+        (LossOptions, "monte_carlo", "yes"),
+        (LossOptions, "failure_value", "low"),
+        (LossOptions, "mean_latents", "goal"),
+        (LossOptions, "dynamics_horizon", 2.5),
+    ],
+)
+def test_values_of_another_type_are_refused_by_name(options, field, value):
+    with pytest.raises(TypeError, match=rf"^{field} must"):
+        options(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        (VAEOptions, "lr"),
+        (VAEOptions, "beta"),
+        (OnlineOptions, "fraction"),
+        (OptimOptions, "dynamics_lr"),
+        (OptimOptions, "cooldown"),
+        (LossOptions, "gamma_safe_set"),
+        (LossOptions, "failure_value"),
+        (LossOptions, "timed_out_weight"),
+    ],
+)
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_numbers_that_are_none_are_refused_by_name(options, field, value):
+    with pytest.raises(ValueError, match=rf"^{field} must"):
+        options(**{field: value})
+
+
+@pytest.mark.parametrize("number", [np.int64(3), np.float32(0.5)])
+def test_numpys_numbers_are_numbers(number):
+    whole = isinstance(number, np.integer)
+    assert (OfflineOptions(dynamics_steps=number) if whole else VAEOptions(lr=number)) is not None
 
 
 @pytest.mark.parametrize(
