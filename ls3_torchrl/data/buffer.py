@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer
 
-from ls3_torchrl._checks import DataWarning, require_at_least
+from ls3_torchrl._checks import DataWarning, require_at_least, require_unit_interval
 from ls3_torchrl.data.conform import conform
 from ls3_torchrl.data.encoding import encode_frames
 from ls3_torchrl.data.episode_store import EpisodeStore
@@ -60,8 +60,8 @@ class TaggedReplayBuffer:
         device: where sampled batches live.
 
     Raises:
-        ValueError: for a capacity below 1, or a key that the buffer needs for itself; in :meth:`add`, for episodes that
-            cannot be understood: of several, none is stored then.
+        ValueError: for a capacity below 1, γ outside [0, 1], γ = 1 with ``continue_failures``, or a key that the buffer
+            needs for itself; in :meth:`add`, for episodes that cannot be understood: of several, none is stored then.
         TypeError: in :meth:`add`, for images of another dtype than uint8, or entries that are no tensors.
         KeyError: in :meth:`add`, for a missing key.
         RuntimeError: in :meth:`sample`, without encoder or without rows of the selection; in :meth:`encode` and
@@ -103,8 +103,13 @@ class TaggedReplayBuffer:
     ) -> None:
         # Plain numbers, whatever NumPy gave: a description on disk holds nothing else.
         self.latent_dim = int(require_at_least(latent_dim, 1, "latent_dim"))
-        self.gamma = float(gamma)
+        self.gamma = require_unit_interval(float(gamma), "gamma")
         self.continue_failures = bool(continue_failures)
+        if self.continue_failures and self.gamma == 1.0:
+            raise ValueError(
+                "gamma must be below 1 with continue_failures=True, got 1.0: a failure that goes on for ever would "
+                "return minus infinity. Lower it, for example to 0.99."
+            )
         self.success_tail = None if success_tail is None else int(require_at_least(success_tail, 1, "success_tail"))
         self.dynamics_after_violation = dynamics_after_violation
         self.device = torch.device(device)

@@ -59,8 +59,11 @@ def _conform(
     out = episode.copy()
     for key in (*keys.required, *extra_keys):
         value = episode.get(key)
-        if not isinstance(value, Tensor):
-            raise TypeError(f"{who}: {key!r} must be a tensor, got {type(value).__name__}. Give numbers.")
+        if not isinstance(value, Tensor) or value.layout != torch.strided or value.is_meta or value.is_nested:
+            kind = type(value).__name__ if not isinstance(value, Tensor) else f"one of {value.layout} on {value.device}"
+            raise TypeError(
+                f"{who}: {key!r} must be an ordinary tensor, got {kind}. Give numbers, for example to_dense()."
+            )
         out.set(key, value.detach())
     for key in (keys.reward, keys.constraint, keys.success):
         _require_column(out.get(key), key, steps, who)

@@ -127,6 +127,7 @@ def split_episodes(data: Episodes) -> list[TensorDictBase]:
         ``[T_i]`` each.
 
     Raises:
+        TypeError: for anything but tensordicts.
         ValueError: for another batch size; or when episodes end within a row, but not with it.
 
     Example:
@@ -137,6 +138,10 @@ def split_episodes(data: Episodes) -> list[TensorDictBase]:
     """
     if isinstance(data, (list, tuple)):
         return [episode for part in data for episode in split_episodes(part)]
+    if not isinstance(data, TensorDictBase):
+        raise TypeError(
+            f"Episodes must be tensordicts, got {type(data).__name__}. Make one of arrays with episode_from_arrays()."
+        )
     if data.ndim not in (1, 2):
         raise ValueError(f"Episodes must have batch size [T] or [N, T], got {list(data.shape)}.")
     if data.ndim == 2:

@@ -422,3 +422,26 @@ def test_online_data_are_overwritten_without_ado():
 def test_a_set_larger_than_the_buffer_is_warned_of():
     with pytest.warns(DataWarning, match="2 of those that are being added"):
         TaggedReplayBuffer(10, latent_dim=2, keys=KEYS).add([episode(4)] * 3, "success")
+
+
+@pytest.mark.parametrize("wrong", [{"state": 1}, None, 3, "episode", torch.zeros(3), [torch.zeros(3)]])
+def test_what_is_no_tensordict_is_refused_with_the_remedy(wrong):
+    with pytest.raises(TypeError, match=r"Episodes must be tensordicts, got .*episode_from_arrays"):
+        make_buffer().add(wrong, "success")
+
+
+@pytest.mark.parametrize("wrong", [lambda x: x.to_sparse(), lambda x: x.to("meta")])
+def test_entries_that_are_no_ordinary_tensors_are_refused(wrong):
+    data = episode()
+    data["next", "reward"] = wrong(data["next", "reward"])
+    with pytest.raises(TypeError, match=r"'reward'\) must be an ordinary tensor, got one of torch"):
+        make_buffer().add(data, "success")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"gamma": 1.1}, "gamma must lie in"), ({"gamma": 1.0, "continue_failures": True}, "gamma must be below 1")],
+)
+def test_discounts_that_make_no_labels_are_refused_by_the_buffer(options, message):
+    with pytest.raises(ValueError, match=message):
+        TaggedReplayBuffer(10, **options)
