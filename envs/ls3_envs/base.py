@@ -119,6 +119,7 @@ class VisualConstraintEnv(EnvBase):
         self._clock = torch.zeros(num_envs, dtype=torch.long, device=self.device)
         self._started = False
         self._generators: list[np.random.Generator] = []
+        self._streams: list[dict] = []
         self._unseeded: list[bytes | None] = []
         self._set_seed(seed)
 
@@ -197,6 +198,7 @@ class VisualConstraintEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         entropy = unused_seed() if seed is None else checked_seed(seed)
         self._generators = [_stream(entropy, index) for index in range(self.num_envs)]
+        self._streams = [generator.bit_generator.state for generator in self._generators]
         #: Of each environment without a seed, the process in which its stream was begun.
         self._unseeded = [process_id() if seed is None else None] * self.num_envs
 
@@ -225,12 +227,34 @@ class VisualConstraintEnv(EnvBase):
                 if begun not in (None, process_id()):
                     self._generators[index], self._unseeded[index] = _stream(entropy, index), process_id()
 
+    def random_state(self) -> list[dict]:
+        """The random streams of all environments, as they stood before each one's last reset; numbers and names only.
+
+        After :meth:`set_random_state` of it, :meth:`reset` begins the same episodes again.
+        """
+        return list(self._streams)
+
+    def set_random_state(self, state: list[dict]) -> None:
+        """Continue with the streams that :meth:`random_state` gave.
+
+        Raises:
+            ValueError: for another number of environments.
+        """
+        if len(state) != self.num_envs:
+            raise ValueError(
+                f"random_state must have one stream for each of {self.num_envs} environments, got {len(state)}."
+            )
+        for generator, stream in zip(self._generators, state, strict=True):
+            generator.bit_generator.state = stream
+        self._streams = list(state)
+
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = torch.arange(self.num_envs) if mask is None else mask.reshape(self.num_envs).nonzero().flatten().cpu()
         self._leave_other_processes_streams()
         state, clock, frozen = self._state.clone(), self._clock.clone(), self._frozen.clone()
         for index in rows.tolist():
+            self._streams[index] = self._generators[index].bit_generator.state
             state[index] = self._initial_state(index, self._generators[index]).to(state)
         clock[rows] = 0
         frozen[rows] = self._violates(state)[rows]

@@ -1,7 +1,7 @@
 """Training as components, on any environment: the VAE, the latent models, and what they know."""
 
 from ls3_torchrl.trainers.diagnostics import StateProbe
-from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner
+from ls3_torchrl.trainers.learner import AuxiliaryLoss, DivergenceError, Learner, LearnerGroup, Stage
 from ls3_torchrl.trainers.ls3 import LS3Trainer
 from ls3_torchrl.trainers.options import (
     LossOptions,
@@ -15,13 +15,16 @@ from ls3_torchrl.trainers.vae import VAETrainer
 
 __all__ = [
     "AuxiliaryLoss",
+    "DivergenceError",
     "LS3Options",
     "LS3Trainer",
     "Learner",
+    "LearnerGroup",
     "LossOptions",
     "OfflineOptions",
     "OnlineOptions",
     "OptimOptions",
+    "Stage",
     "StateProbe",
     "VAEOptions",
     "VAETrainer",

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn import Parameter
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.record.loggers import Logger
 
@@ -49,6 +49,41 @@ def log_scalars(logger: Logger | None, phase: str, step: int, scalars: dict[str,
             logger.log_scalar(f"{phase}/{name}", value, step=step)
 
 
+class DivergenceError(FloatingPointError):
+    """A loss or a gradient is not finite; the networks are as the step before had left them.
+
+    Args:
+        phase: in which it happened.
+        step: gradient steps taken before.
+        scalars: what the losses had written.
+        batch: what they were computed on.
+        remedy: what to do.
+
+    Example:
+        >>> error = DivergenceError("Value", 7, {"loss_value": float("nan")}, None, "Lower its learning rate.")
+        >>> print(error)
+        Value diverged: {'loss_value': nan} at step 7. Lower its learning rate.
+    """
+
+    def __init__(
+        self, phase: str, step: int, scalars: Mapping[str, float], batch: TensorDictBase | None, remedy: str
+    ) -> None:
+        super().__init__(f"{phase} diverged: {dict(scalars)} at step {step}. {remedy}")
+        self.phase, self.step, self.scalars, self.batch = phase, step, dict(scalars), batch
+
+
+def descend(optimizer: torch.optim.Optimizer, parameters: Iterable[Parameter], value: Tensor) -> bool:
+    """One gradient step down ``value``; none, and ``False``, when it or its gradient is not finite."""
+    optimizer.zero_grad()
+    value.backward()
+    # NaN and infinity outlast a sum, which is cheaper than a look at every entry.
+    sums = [parameter.grad.sum() for parameter in parameters if parameter.grad is not None]
+    if not torch.isfinite(torch.stack([value.detach(), *sums]).sum()):
+        return False
+    optimizer.step()
+    return True
+
+
 class AuxiliaryLoss(NamedTuple):
     """A second loss on the same network, with batches of its own.
 
@@ -79,9 +114,11 @@ class Learner:
             last few batches then sway what the agent acts by no more than the others.
         logger: one of TorchRL's (:func:`torchrl.record.loggers.get_logger`); gets every scalar as ``phase/name``.
         progress: show progress bars.
+        after_step: called after every gradient step. The state that :meth:`state_dict` gives there continues in the
+            middle of the phase, and whatever it raises ends the phase.
 
     Raises:
-        FloatingPointError: by :meth:`train`, when a loss is not finite.
+        DivergenceError: by :meth:`train`, when a loss or a gradient is not finite.
 
     Example:
         >>> from tensordict import TensorDict
@@ -110,21 +147,24 @@ class Learner:
         cooldown: float = 0.0,
         logger: Logger | None = None,
         progress: bool = True,
+        after_step: Callable[[], object] | None = None,
     ) -> None:
         self.names = [names] if isinstance(names, str) else list(names)
         self.loss, self.sample, self.auxiliary, self.bf16 = loss, sample, auxiliary, bf16
         self.lr, self.cooldown = lr, cooldown
-        self.logger, self.progress = logger, progress
+        self.logger, self.progress, self.after_step = logger, progress, after_step
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         #: ``None`` where there is nothing to train: a constraint that is known, a goal estimator that is frozen.
         self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True) if self.parameters else None
         self.target_interval, self.tau = target_interval, tau
         self.target: HardUpdate | SoftUpdate | None = None
         self.steps = 0
+        self._phase_steps = 0  # of the phase that train() is in; kept for one that continues in the middle
+        self._batch: TensorDictBase | None = None  # the last one
 
     def compute_loss(self) -> tuple[TensorDictBase, Tensor]:
         """What the losses write for a new batch, and the sum that is minimised."""
-        rows = self._as_parameters(self.sample())
+        rows = self._batch = self._as_parameters(self.sample())
         second = None if self.auxiliary is None else self._as_parameters(self.auxiliary.sample())
         with torch.autocast(self.parameters[0].device.type, torch.bfloat16, enabled=self.bf16):
             losses = self.loss(rows)
@@ -145,21 +185,28 @@ class Learner:
         return rows
 
     def train(self, steps: int, phase: str) -> None:
-        """Take ``steps`` gradient steps, which are logged and shown as ``phase``; none where nothing can be trained."""
+        """Take ``steps`` gradient steps, which are logged and shown as ``phase``; none where nothing can be trained.
+
+        After :meth:`load_state_dict` of a state from the middle of a phase, those that are left of it.
+        """
         if self.optimizer is None:
             return
         self._require_one_precision()
         self._make_target()
         # Networks of this size lose more by waking a second core than they gain by it.
-        with threads(1), progress_bar(steps, phase, enabled=self.progress) as bar:
-            for i in range(steps):
+        with threads(1), progress_bar(steps, phase, done=self._phase_steps, enabled=self.progress) as bar:
+            while self._phase_steps < steps:
                 for group in self.optimizer.param_groups:
-                    group["lr"] = self.lr * cooled_down(i / steps, self.cooldown)
-                losses, value = self._step()
-                if i % LOG_INTERVAL == 0 or i == steps - 1:
-                    self._log(phase, losses)
+                    group["lr"] = self.lr * cooled_down(self._phase_steps / steps, self.cooldown)
+                losses, value = self._step(phase)
+                if self._phase_steps % LOG_INTERVAL == 0 or self._phase_steps == steps - 1:
+                    log_scalars(self.logger, phase, self.steps, self._scalars(losses))
                     bar.set_postfix_str(f"loss {value.item():.4g}", refresh=False)
                 bar.update()
+                self._phase_steps += 1
+                if self.after_step is not None:
+                    self.after_step()
+        self._phase_steps = 0
 
     def _require_one_precision(self) -> None:
         kinds = {
@@ -188,33 +235,30 @@ class Learner:
             # It copies again at calls k + 1, 2(k + 1), …, so k is one less than the interval that is meant.
             self.target = HardUpdate(self.loss, value_network_update_interval=self.target_interval - 1)
 
-    def _step(self) -> tuple[TensorDictBase, Tensor]:
+    def _step(self, phase: str) -> tuple[TensorDictBase, Tensor]:
         assert self.optimizer is not None
         losses, value = self.compute_loss()
-        self.optimizer.zero_grad()
-        value.backward()
-        self.optimizer.step()
+        if not descend(self.optimizer, self.parameters, value):
+            raise DivergenceError(phase, self.steps, self._scalars(losses), self._batch, "Lower its learning rate.")
         if self.target is not None:
             self.target.step()
         self.steps += 1
         return losses, value
 
-    def _log(self, phase: str, losses: TensorDictBase) -> None:
-        scalars = {key: item.item() for key, item in losses.items() if self._is_metric(key, item)}
-        if not all(map(math.isfinite, scalars.values())):
-            raise FloatingPointError(f"{phase} diverged: {scalars} at step {self.steps}. Lower its learning rate.")
-        log_scalars(self.logger, phase, self.steps, scalars)
+    def _scalars(self, losses: TensorDictBase) -> dict[str, float]:
+        return {key: item.item() for key, item in losses.items() if self._is_metric(key, item)}
 
     def _is_metric(self, key: str, item: Tensor) -> bool:
         """Whether an output is worth logging: scalars, and of the losses those that are minimised."""
         return item.numel() == 1 and (not key.startswith("loss_") or key.removeprefix("loss_") in self.names)
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks, lagged networks, optimiser and counters."""
+        """Networks, lagged networks, optimiser and counters, those in the middle of a phase included."""
         return {
             "loss": self.loss.state_dict(),
             "optimizer": None if self.optimizer is None else self.optimizer.state_dict(),
             "steps": self.steps,
+            "phase_steps": self._phase_steps,
             "has_target": self.target is not None,
             "target_counter": getattr(self.target, "counter", 0),
         }
@@ -229,4 +273,49 @@ class Learner:
         self.loss.load_state_dict(state_dict["loss"])
         if self.optimizer is not None:
             self.optimizer.load_state_dict(state_dict["optimizer"])
-        self.steps = state_dict["steps"]
+        self.steps, self._phase_steps = state_dict["steps"], state_dict["phase_steps"]
+
+
+#: A learner's name, its gradient steps, and what they are shown as.
+Stage: TypeAlias = tuple[str, int, str]
+
+
+class LearnerGroup:
+    """Learners that are trained one after another, and continue where a state of them was taken.
+
+    Args:
+        learners: by name.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from ls3_torchrl.modules import GoalEstimator
+        >>> from ls3_torchrl.objectives import ClassifierLoss
+        >>> reached = {"latent": torch.zeros(4, 8), "success": torch.ones(4, 1, dtype=torch.bool)}
+        >>> batch = TensorDict({"next": reached}, [4])
+        >>> goal = Learner("goal", ClassifierLoss(GoalEstimator(8)), lambda: batch, lr=1e-3, progress=False)
+        >>> group = LearnerGroup({"goal": goal})
+        >>> group.train([("goal", 3, "Goal"), ("goal", 2, "Goal again")])
+        >>> goal.steps
+        5
+    """
+
+    def __init__(self, learners: Mapping[str, Learner]) -> None:
+        self.learners = dict(learners)
+        self._finished = 0  # stages of the list that train() is in
+
+    def train(self, stages: Iterable[Stage]) -> None:
+        """Train by a list of stages; after :meth:`load_state_dict`, what is left of the list that was being trained."""
+        for name, steps, phase in list(stages)[self._finished :]:
+            self.learners[name].train(steps, phase)
+            self._finished += 1
+        self._finished = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """That of every learner, and how far the list of stages was carried out."""
+        return {"finished": self._finished} | {name: learner.state_dict() for name, learner in self.learners.items()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue where :meth:`state_dict` was taken."""
+        self._finished = state_dict["finished"]
+        for name, learner in self.learners.items():
+            learner.load_state_dict(state_dict[name])

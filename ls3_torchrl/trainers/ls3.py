@@ -21,7 +21,7 @@ from ls3_torchrl.objectives import (
     TD1ValueLoss,
 )
 from ls3_torchrl.trainers.checks import require_actions_of, warn_of_missing_outcomes
-from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner, wants_bf16
+from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner, LearnerGroup, Stage, wants_bf16
 from ls3_torchrl.trainers.options import LS3Options
 
 #: The learners in the order in which they are trained.
@@ -40,10 +40,11 @@ class LS3Trainer:
             ``None``.
         logger: one of TorchRL's; gets every metric as ``phase/name``.
         progress: show progress bars.
+        after_step: called after every gradient step; see :class:`~ls3_torchrl.trainers.Learner`.
 
     Raises:
         ValueError: for options that do not fit the buffer's.
-        FloatingPointError: by training, when a loss is not finite.
+        DivergenceError: by training, when a loss or a gradient is not finite.
 
     Example:
         >>> from tensordict import TensorDict
@@ -73,6 +74,7 @@ class LS3Trainer:
         episode_length: int | None = None,
         logger: Logger | None = None,
         progress: bool = True,
+        after_step: Callable[[], object] | None = None,
     ) -> None:
         self.agent, self.buffer = agent, buffer
         self.options = options = LS3Options() if options is None else options
@@ -94,6 +96,7 @@ class LS3Trainer:
             "cooldown": optim.cooldown,
             "logger": logger,
             "progress": progress,
+            "after_step": after_step,
         }
         self._everything = RowSelection(online_fraction=options.online.fraction)
         self.dynamics = self._dynamics_learner()
@@ -104,6 +107,7 @@ class LS3Trainer:
         for name in options.loss.mean_latents:
             keys = {"latent": "loc", "next_latent": ("next", "loc")}
             self.learners[name].loss.set_keys(**(keys if name == "dynamics" else {"latent": ("next", "loc")}))
+        self._group = LearnerGroup(self.learners)
 
     @property
     def learners(self) -> dict[str, Learner]:
@@ -229,28 +233,37 @@ class LS3Trainer:
         warn_of_missing_outcomes(self.buffer)
         steps = self.options.offline
         self._failure_value = None
-        self.dynamics.train(steps.dynamics_steps, "Dynamics")
-        self.value.train(steps.value_steps, "Value, reward-to-go")
-        self.value_td.train(steps.value_td_steps, "Value, TD-1")
-        self._train_classifiers(steps.classifier_steps)
+        self._group.train(
+            [
+                ("dynamics", steps.dynamics_steps, "Dynamics"),
+                ("value", steps.value_steps, "Value, reward-to-go"),
+                ("value_td", steps.value_td_steps, "Value, TD-1"),
+                *self._classifiers(steps.classifier_steps),
+            ]
+        )
 
     def update(self) -> None:
         """One update on all data, after new episodes."""
         steps = self.options.online
-        self.dynamics.train(steps.dynamics_steps, "Dynamics")
-        self.value_td.train(steps.value_td_steps, "Value, TD-1")
-        self._train_classifiers(steps.classifier_steps)
+        self._group.train(
+            [
+                ("dynamics", steps.dynamics_steps, "Dynamics"),
+                ("value_td", steps.value_td_steps, "Value, TD-1"),
+                *self._classifiers(steps.classifier_steps),
+            ]
+        )
 
-    def _train_classifiers(self, steps: int) -> None:
-        self.safe_set.train(steps, "Safe set")
-        self.constraint.train(steps, "Constraint")
-        self.goal.train(steps, "Goal")
+    def _classifiers(self, steps: int) -> list[Stage]:
+        names = {"safe_set": "Safe set", "constraint": "Constraint", "goal": "Goal"}
+        return [(name, steps, phase) for name, phase in names.items()]
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks, lagged networks, optimisers and counters of every learner."""
-        return {name: learner.state_dict() for name, learner in self.learners.items()}
+        """Networks, lagged networks, optimisers and counters of every learner.
+
+        Taken by ``after_step``, it continues in the middle: the method that was training is to be called again.
+        """
+        return self._group.state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue where :meth:`state_dict` was taken."""
-        for name, learner in self.learners.items():
-            learner.load_state_dict(state_dict[name])
+        self._group.load_state_dict(state_dict)

@@ -9,18 +9,20 @@ from tqdm import tqdm
 _FORMAT = "{desc} {percentage:3.0f}%|{bar:24}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 
 
-def progress_bar(total: int, description: str, *, unit: str = "step", enabled: bool = True) -> tqdm:
+def progress_bar(total: int, description: str, *, unit: str = "step", done: int = 0, enabled: bool = True) -> tqdm:
     """A progress bar with the time left; a line now and then where there is no terminal.
 
     Args:
         total: steps in all.
         description: what is going on.
         unit: of the steps.
+        done: how many of them were taken earlier.
         enabled: whether anything is shown.
     """
     interactive = sys.stderr.isatty()
     return tqdm(
         total=total,
+        initial=done,
         desc=f"{description:<24}",
         unit=unit,
         mininterval=0.2 if interactive else 20.0,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -16,7 +15,7 @@ from ls3_torchrl.agent import LS3Agent
 from ls3_torchrl.data import TaggedReplayBuffer, random_perspective, random_resized_crop
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
 from ls3_torchrl.trainers.checks import require_actions_of
-from ls3_torchrl.trainers.learner import LOG_INTERVAL, log_scalars, threads, wants_bf16
+from ls3_torchrl.trainers.learner import LOG_INTERVAL, DivergenceError, descend, log_scalars, threads, wants_bf16
 from ls3_torchrl.trainers.options import VAEOptions
 from ls3_torchrl.trainers.progress import progress_bar
 
@@ -44,11 +43,13 @@ class VAETrainer:
         options: how.
         logger: one of TorchRL's; gets every metric as ``VAE/name``.
         progress: show progress bars.
+        after_step: called after every gradient step and every batch of frames that is encoded; see
+            :class:`~ls3_torchrl.trainers.Learner`.
 
     Raises:
         ValueError: for an agent whose encoder is not a VAE's or that has no decoder; an encoder that is trained already
             needs none of this, but ``buffer.encode(agent.encoder)``.
-        FloatingPointError: by :meth:`train`, when the loss is not finite.
+        DivergenceError: by :meth:`train`, when the loss or a gradient is not finite.
 
     Example:
         >>> from tensordict import TensorDict
@@ -71,10 +72,11 @@ class VAETrainer:
         *,
         logger: Logger | None = None,
         progress: bool = True,
+        after_step: Callable[[], object] | None = None,
     ) -> None:
         self.agent, self.buffer = agent, buffer
         self.options = options = VAEOptions() if options is None else options
-        self.logger, self.progress = logger, progress
+        self.logger, self.progress, self.after_step = logger, progress, after_step
         if agent.encoder is None or agent.decoder is None:
             raise ValueError(
                 "VAETrainer needs an agent with an encoder and a decoder. An encoder that is trained already needs no "
@@ -87,19 +89,22 @@ class VAETrainer:
                 "PixelDecoder have. Pass unit_scale=False for others."
             )
         self.steps = 0
-        self._finished = False
+        self._error = 0.0  # of reconstruction, as it was last logged
+        self._checked = self._rescaled = False
+        #: Whether all of it is done: encoder and decoder are trained and frozen, and every frame is encoded.
+        self.finished = False
         for half in (agent.encoder, agent.decoder):
             half.to(memory_format=torch.channels_last)
         self.loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta, reduction=options.reduction)
         self.loss.set_keys(pixels="vae_input", target="vae_target")
-        learnt = list(self.loss.parameters())
+        self._learnt = list(self.loss.parameters())
         self.prediction: LatentPredictionLoss | None = None
         if options.prediction_weight:
             self.prediction = LatentPredictionLoss(agent.encoder, agent.dynamics)
             keys = buffer.keys
             self.prediction.set_keys(pixels=keys.observation, action=keys.action, next_pixels=keys.next_observation)
-            learnt += agent.dynamics.parameters()
-        self.optimizer = torch.optim.Adam(learnt, lr=options.lr, fused=True)
+            self._learnt += agent.dynamics.parameters()
+        self.optimizer = torch.optim.Adam(self._learnt, lr=options.lr, fused=True)
         self.schedule: torch.optim.lr_scheduler.LRScheduler = (
             torch.optim.lr_scheduler.OneCycleLR(self.optimizer, options.lr, total_steps=options.steps, pct_start=0.1)
             if options.schedule == "onecycle"
@@ -117,34 +122,41 @@ class VAETrainer:
         require_actions_of(self.agent, self.buffer)
         if self.options.checkpoint is not None:
             self._take_checkpoint(self.options.checkpoint)
-            return
-        if self.steps < self.options.steps:
+        else:
             self._minimise()
-        for half in (self.agent.encoder, self.agent.decoder):
-            half.requires_grad_(False)
+            if self.options.reduction == "mean" and not self._checked:
+                self._warn_of_collapse(self._error)
+            self._checked = True
         self.encode()
-        if self.options.unit_scale and not self._finished:
+        if self.options.unit_scale and self.options.checkpoint is None and not self._rescaled:
             spread = float(self.buffer.transitions.storage[:]["loc"].std(0).square().mean().sqrt())
             self.agent.encoder.rescale(1.0 / spread)
             self.agent.decoder.rescale(1.0 / spread)
+            self._rescaled = True
             self.encode()
-        self._finished = True
+        self.finished = True
 
     def encode(self) -> None:
-        """Encode every frame of the buffer."""
+        """Freeze encoder and decoder, and encode every frame of the buffer."""
+        for half in (self.agent.encoder, self.agent.decoder):
+            half.requires_grad_(False)
         with progress_bar(len(self.buffer.frames), "Encoding", unit="frame", enabled=self.progress) as bar:
-            self.buffer.encode(self.agent.encoder, progress=lambda done, _: bar.update(done - bar.n))
+
+            def advance(done: int, _: int) -> None:
+                bar.update(done - bar.n)
+                if self.after_step is not None:
+                    self.after_step()
+
+            self.buffer.encode(self.agent.encoder, progress=advance)
 
     def _take_checkpoint(self, path: str) -> None:
-        """Take encoder and decoder of a trained agent, frozen, and encode every frame."""
+        """Take encoder and decoder of a trained agent."""
         shape = self.agent.architecture
         trained = LS3Agent.load(
             path, in_channels=shape.in_channels, latent_dim=shape.latent_dim, background=shape.background
         )
         for half, other in ((self.agent.encoder, trained.encoder), (self.agent.decoder, trained.decoder)):
             half.load_state_dict(other.state_dict())
-            half.requires_grad_(False)
-        self.encode()
 
     def _minimise(self) -> None:
         options = self.options
@@ -152,17 +164,19 @@ class VAETrainer:
             self.agent.decoder.set_background(self.buffer.mean_frame())
         with (
             threads(options.threads),
-            progress_bar(options.steps - self.steps, PHASE, enabled=self.progress) as bar,
+            progress_bar(options.steps, PHASE, done=self.steps, enabled=self.progress) as bar,
         ):
             while self.steps < options.steps:
                 losses = self._step()
                 if self.steps % LOG_INTERVAL == 0 or self.steps == options.steps - 1:
-                    scalars = self._log(losses)
-                    bar.set_postfix_str(f"error {scalars['reconstruction']:.2e}", refresh=False)
+                    scalars = {key: item.item() for key, item in losses.items()}
+                    log_scalars(self.logger, PHASE, self.steps, scalars)
+                    self._error = scalars["reconstruction"]
+                    bar.set_postfix_str(f"error {self._error:.2e}", refresh=False)
                 self.steps += 1
                 bar.update()
-        if options.reduction == "mean":
-            self._warn_of_collapse(scalars["reconstruction"])
+                if self.after_step is not None:
+                    self.after_step()
 
     def _step(self) -> TensorDictBase:
         options = self.options
@@ -175,9 +189,9 @@ class VAETrainer:
             if self.prediction is not None and warmth:
                 losses["prediction"] = self.prediction(batch)["loss_prediction"]
                 value = value + warmth * options.prediction_weight * losses["prediction"]
-        self.optimizer.zero_grad()
-        value.backward()
-        self.optimizer.step()
+        if not descend(self.optimizer, self._learnt, value):
+            scalars = {key: item.item() for key, item in losses.items()}
+            raise DivergenceError(PHASE, self.steps, scalars, batch, "Lower VAEOptions.lr.")
         self.schedule.step()
         return losses
 
@@ -209,13 +223,6 @@ class VAETrainer:
             pixels[changed] = random_perspective(pixels[changed])
         return pixels
 
-    def _log(self, losses: TensorDictBase) -> dict[str, float]:
-        scalars = {key: item.item() for key, item in losses.items()}
-        if not all(map(math.isfinite, scalars.values())):
-            raise FloatingPointError(f"The VAE diverged: {scalars} at step {self.steps}. Lower VAEOptions.lr.")
-        log_scalars(self.logger, PHASE, self.steps, scalars)
-        return scalars
-
     def _warn_of_collapse(self, error: float) -> None:
         """Say so when the VAE draws little more than the mean of all images: nothing can be learnt from its latents."""
         images = self.buffer.sample_frames(512)[self.buffer.keys.observation].float() / 255.0
@@ -236,7 +243,10 @@ class VAETrainer:
             "optimizer": self.optimizer.state_dict(),
             "schedule": self.schedule.state_dict(),
             "steps": self.steps,
-            "finished": self._finished,
+            "error": self._error,
+            "checked": self._checked,
+            "rescaled": self._rescaled,
+            "finished": self.finished,
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -245,4 +255,6 @@ class VAETrainer:
         self.agent.dynamics.load_state_dict(state_dict["dynamics"])
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.schedule.load_state_dict(state_dict["schedule"])
-        self.steps, self._finished = state_dict["steps"], state_dict["finished"]
+        self.steps, self._error = state_dict["steps"], state_dict["error"]
+        self._checked, self._rescaled = state_dict["checked"], state_dict["rescaled"]
+        self.finished = state_dict["finished"]

@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ls3_recipes.arguments import name_in
 from ls3_recipes.overrides import CONF, GROUPS, parse
-from ls3_recipes.run_folder import read_yaml
+from ls3_recipes.run_files import read_yaml
 
 
 def composed(command: str, overrides: Sequence[str], folder: str | None = None) -> DictConfig:

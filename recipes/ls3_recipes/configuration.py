@@ -22,7 +22,7 @@ from ls3_recipes.options import build, defaults
 from ls3_recipes.overrides import CONF, GROUPS, check, choices_of
 from ls3_recipes.relevance import prune, refuse_irrelevant, refuse_unread
 from ls3_recipes.renamed import RENAMED, on_command_line, rename_overrides, rename_settings
-from ls3_recipes.run_folder import read_yaml
+from ls3_recipes.run_files import read_yaml
 from ls3_recipes.run_settings import RunSettings
 from ls3_recipes.typed import did_you_mean
 
@@ -208,17 +208,17 @@ def run_command(
     folder = config_dir(options)
 
     def run(chosen: S) -> None:
-        with _errors_in_one_line(who, Path(getattr(chosen, "output", ""))):
+        with errors_in_one_line(who, Path(getattr(chosen, "output", None) or "")):
             job(chosen)
 
     def under_hydra(config: DictConfig) -> None:
-        with _errors_in_one_line(who):
+        with errors_in_one_line(who):
             chosen = settings_from(config, settings, overrides, renamed)
         run(chosen)
 
     with command_line(who), on_command_line(who):
         overrides = rename_overrides(overrides, renamed)
-        with _errors_in_one_line(who):
+        with errors_in_one_line(who):
             if {"-h", "--help"} & set(options):
                 _check(command, settings, overrides, folder)
                 print(help_of(command, settings, overrides, help_text, folder=folder))
@@ -241,7 +241,7 @@ def _of_hydra(options: Sequence[str]) -> bool:
 
 
 @contextmanager
-def _errors_in_one_line(who: str, output: Path | None = None) -> Iterator[None]:
+def errors_in_one_line(who: str, output: Path | None = None) -> Iterator[None]:
     """End the process with one line for what is wrong with settings, data and files, as long as no output is made."""
     before = output is not None and os.path.lexists(output)
     try:

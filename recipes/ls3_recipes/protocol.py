@@ -2,34 +2,39 @@
 
 from __future__ import annotations
 
+import shutil
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from ls3_recipes.algorithms import ALGORITHMS
+from ls3_recipes.checkpoints import Stateful
 from ls3_recipes.console import console, print_summary
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.figures import Figures, best_update, episode_figures, means_of, summarise
-from ls3_recipes.options import as_dict
+from ls3_recipes.interrupts import Interrupts
 from ls3_recipes.plots.run import pictures_of_run
 from ls3_recipes.plots.style import draw
+from ls3_recipes.progress import HeldRandomState, Progress, Worlds
+from ls3_recipes.resume import open_folder, require_place
 from ls3_recipes.rollout import collect_demonstrations, make_env, run_episodes, tick, whole_episodes
-from ls3_recipes.run_folder import RunFolder, require_new
-from ls3_recipes.run_settings import RunSettings
+from ls3_recipes.run_settings import RunSettings, decided
 from ls3_recipes.together import require_room, require_tools
 from ls3_torchrl.data import Tag, check_datasets, load_episodes, save_episodes
+from ls3_torchrl.files import save_atomically, save_json_atomically
+from ls3_torchrl.trainers import DivergenceError
 from ls3_torchrl.trainers.learner import log_scalars
 from ls3_torchrl.trainers.progress import progress_bar
 
+#: Of the online episodes, what figures and pictures need beyond what is learnt from.
+_KEPT = ("state", ("next", "state"), ("next", "done"))
 Offline = dict[Tag, TensorDictBase]
 
 
 def run_experiment(settings: RunSettings) -> dict:
-    """Follow the protocol from demonstrations to pictures.
+    """Follow the protocol from demonstrations to pictures, from where the run in the output folder was cut off.
 
     Args:
         settings: of the run; an instance of its algorithm's ``settings_class``.
@@ -40,15 +45,28 @@ def run_experiment(settings: RunSettings) -> dict:
     Raises:
         ValueError, FileNotFoundError, FileExistsError: for settings, data or folders that cannot be used; before any
             work is done.
+        Interrupted: for Ctrl-C or SIGTERM, when the state is on the disk.
+        DivergenceError: when training diverges; what it was computed on is kept in the folder's ``diverged/``.
     """
-    experiment = Experiment(settings)
-    experiment.start()
-    experiment.collect()
-    experiment.train_offline()
-    experiment.improve_online()
-    experiment.select()
-    experiment.evaluate()
-    return experiment.finish()
+    with Interrupts() as interrupts:
+        experiment = Experiment(settings, interrupts)
+        experiment.start()
+        try:
+            experiment.collect()
+            experiment.resume()
+            experiment.train_offline()
+            experiment.improve_online()
+            experiment.select()
+            experiment.evaluate()
+            return experiment.finish()
+        except DivergenceError as error:
+            experiment.keep(error)
+            raise
+        except KeyboardInterrupt:
+            console.print(f"Stopped. To go on: ls3 train resume={experiment.folder.path}")
+            raise
+        finally:
+            experiment.folder.close()
 
 
 def seeds(seed: int) -> dict[str, int]:
@@ -64,12 +82,14 @@ class Experiment:
 
     Args:
         settings: of the run.
+        interrupts: what asks it to stop.
     """
 
-    def __init__(self, settings: RunSettings) -> None:
-        require_new(settings.output)
-        self.settings, self.seed = settings, seeds(settings.seed)
+    def __init__(self, settings: RunSettings, interrupts: Interrupts) -> None:
         self.device = choose_device(settings.device)
+        self.settings, self.seed = decided(settings, self.device), seeds(settings.seed)
+        require_place(self.settings)
+        self.interrupts = interrupts
         if settings.threads:
             torch.set_num_threads(settings.threads)
         torch.manual_seed(self.seed["learning"])
@@ -83,7 +103,9 @@ class Experiment:
         require_room(settings, self.offline, self.horizon)
         self.online: list[Figures] = []
         self.tracks: list[torch.Tensor] = []
-        self.seconds: dict[str, float] = {}
+        self.progress = Progress()
+        self.random = HeldRandomState()
+        self._saved = time.monotonic()
 
     def _given_data(self) -> Offline:
         """The offline data that the settings name."""
@@ -101,72 +123,123 @@ class Experiment:
             raise type(error)(f"data={self.settings.data}: {error}") from error
         return offline
 
-    @contextmanager
-    def _timed(self, phase: str) -> Iterator[None]:
-        """Add the block's wall-clock seconds to those of a phase."""
-        start = time.perf_counter()
-        yield
-        self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - start
+    @property
+    def _parts(self) -> dict[str, Stateful]:
+        """What a run continues from: with the episodes on the disk, all that decides what it will do."""
+        return {
+            "progress": self.progress,
+            "worlds": self._worlds,
+            "log": self.folder.logger,
+            "random": self.random,
+            "algorithm": self.algorithm,
+        }
+
+    def _save(self) -> None:
+        with self.interrupts.deferred():
+            self.folder.states.save(self._parts)
+            self._saved = time.monotonic()
+
+    def _after_step(self) -> None:
+        """Save now and then, and when asked to stop."""
+        if self.interrupts.pending or time.monotonic() - self._saved > 60.0 * self.settings.checkpoint_minutes:
+            self.folder.states.save(self._parts)
+            self._saved = time.monotonic()
+            self.interrupts.check()
 
     def start(self) -> None:
-        """Make the run's folder."""
-        self.folder = RunFolder(self.settings.output, as_dict(self.settings))
+        """Make the run's folder, or go back to the one in which it was cut off."""
+        self.folder = open_folder(self.settings)
+        self._worlds = Worlds(self.env)
 
     def collect(self) -> None:
-        """Collect the demonstrations, unless they were given, and fill the buffer."""
-        task, seed = self.settings.task, self.settings.seed
-        with self._timed("demonstrations"):
-            if not self.offline:
+        """Collect the demonstrations, unless they are there, and fill the buffer."""
+        task, path = self.settings.task, self.folder.path / "demonstrations"
+        with self.progress.timed("demonstrations"):
+            if not self.offline and not path.exists():
                 with torch.random.fork_rng():  # what is learnt does not depend on whether the data were there already
                     collected = collect_demonstrations(task, self.seed["demonstrations"])
-                path = save_episodes(collected, self.folder.path / "demonstrations", task=task.name, seed=seed)
-                self.offline = load_episodes(path)  # from the disk from now on: there may be more than memory
+                save_episodes(collected, path, task=task.name, seed=self.settings.seed)
+            if not self.offline:
+                self.offline = load_episodes(path)  # from the disk: there may be more than memory
             for tag, episodes in self.algorithm.offline_data(self.offline).items():
                 self.buffer.add(episodes, tag)
+        self.algorithm.begin(self.buffer, self.folder.logger, self.horizon, self._after_step)
+
+    def resume(self) -> None:
+        """Take up the state that was saved last, and the episodes that were collected until then."""
+        if not self.folder.states.load(self._parts):
+            self.folder.logger.restart()
+            return
+        if "vae" in self.progress.phases:
+            self.algorithm.encode()
+        for update in range(1, self.progress.collected + 1):
+            episodes = load_episodes(self.folder.episodes(update))[Tag.ONLINE]
+            self._remember(episodes)
+            self.buffer.add(episodes, Tag.ONLINE)
 
     def train_offline(self) -> None:
         """Carry out the algorithm's offline phases."""
-        self.algorithm.begin(self.buffer, self.folder.logger, self.horizon)
         for phase, train in self.algorithm.phases().items():
-            with self._timed(phase):
-                train()
-        self.algorithm.save(self.folder.checkpoint(0))
+            if phase not in self.progress.phases:
+                self.random.release()
+                with self.interrupts.deferred():
+                    with self.progress.timed(phase):
+                        train()
+                    self.progress.phases.append(phase)
+                    self._save()
+        if self.progress.collected == 0:
+            self.algorithm.save(self.folder.agent(0))
 
     def improve_online(self) -> None:
         """Collect episodes with the policy and learn from them, round by round."""
         updates, frames = self.settings.online.updates, self.settings.online.episodes_per_update * self.horizon
-        if updates == 0:
-            return
+        left = updates - self.progress.collected
         bar = progress_bar(self.horizon, "Planning")
         ticking = self.algorithm.policy.register_forward_hook(lambda *_: tick(bar))
-        collector = Collector(
+        if self.progress.collected == 0:
+            self.random.release()  # that state was saved before there was a collector
+        rounds = iter(self._collector(frames, left)) if left else iter(())
+        self.random.release()
+        for update in range(self.progress.updated + 1, updates + 1):
+            if update > self.progress.collected:
+                bar.reset(total=self.horizon)
+                bar.set_description_str(f"{f'Episodes, update {update}/{updates}':<24}")
+                with self.progress.timed("planning"):
+                    episodes = whole_episodes(next(rounds))
+                with self.interrupts.deferred():
+                    self._keep_episodes(update, episodes)
+            with self.interrupts.deferred():
+                with self.progress.timed("updates"):
+                    self.algorithm.update()
+                self.algorithm.save(self.folder.agent(update))
+                self.progress.updated = update
+        ticking.remove()
+        bar.close()
+
+    def _collector(self, frames: int, rounds: int) -> Collector:
+        return Collector(
             self.env,
             self.algorithm.policy,
             frames_per_batch=frames,
-            total_frames=updates * frames,
+            total_frames=rounds * frames,
             device=self.device,
         )
-        rounds = iter(collector)
-        for update in range(1, updates + 1):
-            bar.reset(total=self.horizon)
-            bar.set_description_str(f"{f'Episodes, update {update}/{updates}':<24}")
-            with self._timed("planning"):
-                episodes = whole_episodes(next(rounds))
-            self._record(update, episodes)
-            self.buffer.add(episodes, Tag.ONLINE)
-            with self._timed("updates"):
-                self.algorithm.update()
-            self.algorithm.save(self.folder.checkpoint(update))
-        ticking.remove()
-        bar.close()
-        collector.shutdown()
+
+    def _keep_episodes(self, update: int, episodes: TensorDictBase) -> None:
+        """Bring the episodes of a round to the disk, before anything is learnt from them."""
+        path = self.folder.episodes(update)
+        if path.exists():  # of a process that ended before its state was saved: they are collected again
+            shutil.rmtree(path)
+        kept = episodes.select(*self.buffer.keys.required, *self.buffer.extra_keys, *_KEPT, strict=False)
+        save_episodes({Tag.ONLINE: kept}, path, task=self.settings.task.name, seed=self.settings.seed)
+        self._record(update, episodes)
+        self.buffer.add(kept, Tag.ONLINE)
+        self.progress.collected = update
+        self._save()
 
     def _record(self, update: int, episodes: TensorDictBase) -> None:
-        """Keep and tell how the episodes of a round went."""
-        figures = episode_figures(episodes)
-        self.online.append(figures)
-        self.tracks.append(episodes["next", "state"].cpu())
-        means = means_of(figures)
+        """Tell how the episodes of a round went."""
+        means = means_of(self._remember(episodes))
         step = update * self.settings.online.episodes_per_update
         log_scalars(self.folder.logger, "online", step, means | self.algorithm.describe(episodes))
         console.print(
@@ -174,23 +247,41 @@ class Experiment:
             f"violation {means['mean_violation']:.0%}"
         )
 
+    def _remember(self, episodes: TensorDictBase) -> Figures:
+        """Keep how the episodes of a round went."""
+        figures = episode_figures(episodes)
+        self.online.append(figures)
+        self.tracks.append(episodes["next", "state"].cpu())
+        return figures
+
+    def keep(self, error: DivergenceError) -> None:
+        """Keep what training diverged on, for a look; the state that was saved last stays."""
+        path = self.folder.path / "diverged"
+        save_json_atomically({"error": str(error), "phase": error.phase, "step": error.step}, path / "error.json")
+        content = {
+            "batch": None if error.batch is None else error.batch.to_dict(),
+            "state": self.algorithm.state_dict(),
+        }
+        save_atomically(content, path / "state.pt")
+        console.print(f"The batch and the state of that moment are in [bold]{path}[/bold].")
+
     def select(self) -> None:
         """Keep the agent: the last one, or the one whose episodes went best."""
         if self.settings.online.select == "best" and self.online:
             # An agent that acted, and is known by its episodes; the last one never did.
             best = best_update(self.online)
-            self.algorithm.restore(self.folder.checkpoint(best))
+            self.algorithm.restore(self.folder.agent(best))
             console.print(f"agent.pt is the agent of update {best + 1}, whose episodes went best")
         self.agent_file = self.algorithm.save(self.folder.path / "agent.pt").name
 
     def evaluate(self) -> None:
         """Let the agent act without exploring, and ask what it has learnt."""
         settings = self.settings
-        with self._timed("evaluation"):
+        with self.progress.timed("evaluation"):
             env = make_env(settings.task, settings.evaluation.episodes, self.seed["evaluation"], self.device)
             self.algorithm.prepare(env)
             self.evaluation = run_episodes(env, self.algorithm.policy, what="Evaluation")
-        with self._timed("probe"):
+        with self.progress.timed("probe"):
             self.probe = self.algorithm.diagnose(self.offline, self.evaluation)
 
     def finish(self) -> dict:
@@ -198,11 +289,11 @@ class Experiment:
         summary = self._summary()
         self._write(summary)
         if self.settings.pictures:
-            with self._timed("pictures"):
+            with self.progress.timed("pictures"):
                 failed = self._draw()
             summary |= {"failed_pictures": failed} if failed else {}
             self._write(summary)
-        self.folder.close()
+        self.folder.states.remove()
         print_summary(summary, self.folder.path)
         return summary
 
@@ -215,7 +306,7 @@ class Experiment:
 
     def _write(self, summary: dict) -> None:
         summary["minutes"] = self.folder.minutes
-        summary["seconds"] = {name: round(value, 1) for name, value in self.seconds.items()}
+        summary["seconds"] = {name: round(value, 1) for name, value in self.progress.seconds.items()}
         self.folder.write_json("summary.json", summary)
 
     def _summary(self) -> dict:

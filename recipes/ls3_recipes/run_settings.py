@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
+
+import torch
 
 import ls3_envs
 from ls3_recipes.options import from_signatures
 from ls3_torchrl._checks import require_at_least, require_choice, require_positive, require_unit_interval
 from ls3_torchrl.agent import AgentArchitecture
 from ls3_torchrl.data import TaggedReplayBuffer
+from ls3_torchrl.layers import fastest_precision
 from ls3_torchrl.trainers import VAEOptions
 
+S = TypeVar("S", bound="RunSettings")
 #: The parts of a run have seeds of their own, up to ten thousand times as large.
 _LARGEST_SEED = 10**14
 
@@ -140,7 +145,8 @@ class RunSettings:
         algorithm: what learns; a name in ``ls3_recipes.algorithms.ALGORITHMS``.
         preset: how much effort, as the files in ``conf/preset`` say.
         seed: of everything.
-        output: the run's folder; one that exists is never written into.
+        output: the run's folder; a run that was cut off there goes on. ``None`` for one below ``runs/``.
+        checkpoint_minutes: while training, the run's state is saved this often; also after every round of episodes.
         data: a folder of episodes made by ``ls3 collect``; ``None`` collects them anew.
         scratch_dir: memory-map the replay buffer in this folder instead of holding it in memory.
         device: ``"auto"``, ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
@@ -158,7 +164,8 @@ class RunSettings:
 
     algorithm: str
     preset: str
-    output: str
+    output: str | None = None
+    checkpoint_minutes: float = 3.0
     seed: int = 0
     data: str | None = None
     scratch_dir: str | None = None
@@ -189,3 +196,21 @@ class RunSettings:
     def unread(self) -> dict[str, str]:
         """Sections that nothing reads as the settings are, and the setting that would change that."""
         return {}
+
+
+def decided(settings: S, device: torch.device) -> S:
+    """Settings in which nothing is ``"auto"``: what a measurement decides is decided once for the whole run.
+
+    Args:
+        settings: of a run.
+        device: that it computes on.
+    """
+    choices = {"vae": "autocast", "optim": "autocast", "planner": "precision"}
+    changes: dict[str, Any] = {"device": str(device)}
+    for name, choice in choices.items():
+        section = getattr(settings, name, None)
+        if getattr(section, choice, None) == "auto":
+            fastest = fastest_precision(device.type)
+            value = fastest if choice == "precision" else fastest == "bf16"
+            changes[name] = dataclasses.replace(section, **{choice: value})  # type: ignore[type-var]
+    return dataclasses.replace(settings, **changes)

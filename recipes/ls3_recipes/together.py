@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 import ls3_envs
 from ls3_recipes.options import as_dict
 from ls3_recipes.rollout import make_env
-from ls3_recipes.run_folder import require_folder
+from ls3_recipes.run_files import require_folder
 from ls3_recipes.run_settings import RunSettings
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag

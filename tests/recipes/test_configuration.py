@@ -12,6 +12,7 @@ import ls3_envs
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.configuration import CONF, choices_of, settings_from, settings_of_run, train_settings
 from ls3_recipes.options import as_dict
+from ls3_recipes.resume import name_of
 from ls3_torchrl import LS3Agent
 
 PRESETS = ("cpu", "paper", "smoke")
@@ -98,7 +99,7 @@ def test_every_setting_of_every_task_and_preset(algorithm, task, preset):
     settings = flat(as_dict(train_settings(f"algorithm={algorithm}", f"task={task}", f"preset={preset}")))
     names = {key: settings.pop(key) for key in ("algorithm", "task.name", "preset")}
     assert list(names.values()) == [algorithm, task, preset]
-    assert settings.pop("output")
+    assert settings.pop("output") is None
     expected = resolved("ls3", task, preset)
     if algorithm != "ls3":  # a baseline has what it shares with LS³, and its own
         own = resolved(algorithm, task, preset)
@@ -146,10 +147,9 @@ def test_arguments_win_over_the_preset():
     assert settings.seed == 7
 
 
-def test_the_output_folder_is_named_after_task_preset_and_seed_and_after_a_baseline():
-    assert Path(train_settings("preset=smoke", "seed=4").output).name.startswith("navigation-smoke-seed4")
-    baseline = train_settings("algorithm=bc", "preset=smoke", "seed=4")
-    assert Path(baseline.output).name.startswith("bc-navigation-smoke-seed4")
+def test_a_run_is_named_after_task_preset_and_seed_and_after_a_baseline():
+    assert name_of(train_settings("preset=smoke", "seed=4")) == "navigation-smoke-seed4"
+    assert name_of(train_settings("algorithm=bc", "preset=smoke", "seed=4")) == "bc-navigation-smoke-seed4"
 
 
 def test_every_domain_has_a_file_of_settings_and_every_file_a_domain():

@@ -10,7 +10,9 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.record.loggers import Logger
 
-from ls3_recipes.run_folder import RunFolder, RunLogger, read_metrics
+from ls3_recipes.run_files import read_metrics
+from ls3_recipes.run_folder import RunFolder
+from ls3_recipes.run_logger import RunLogger
 
 
 def test_scalars_go_to_the_table_and_to_tensorboard(tmp_path):
@@ -38,15 +40,15 @@ def test_metrics_of_a_dictionary_are_taken_as_every_logger_of_torchrl_takes_them
 
 
 def test_a_folder_begins_with_settings_and_versions_and_is_never_reused(tmp_path):
-    folder = RunFolder(tmp_path / "run", {"seed": 3, "agent": {"hidden": [16]}})
+    folder = RunFolder.make(tmp_path / "run", {"seed": 3, "agent": {"hidden": [16]}})
     folder.close()
     assert OmegaConf.load(folder.path / "config.yaml") == {"seed": 3, "agent": {"hidden": [16]}}
     versions = json.loads((folder.path / "versions.json").read_text())
     assert versions["torch"] == version("torch")
     assert versions["python"] == platform.python_version()
-    assert folder.checkpoint(7).name == "agent_007.pt"
+    assert folder.agent(7).name == "agent_007.pt"
     with pytest.raises(FileExistsError, match=r"exists already.*output=DIR"):
-        RunFolder(tmp_path / "run", {})
+        RunFolder.make(tmp_path / "run", {})
 
 
 def test_settings_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
@@ -55,12 +57,12 @@ def test_settings_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "replace", fail)
     with pytest.raises(OSError, match="no power"):
-        RunFolder(tmp_path / "run", {"seed": 3})
+        RunFolder.make(tmp_path / "run", {"seed": 3})
     assert not (tmp_path / "run" / "config.yaml").exists()
 
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path):
-    folder = RunFolder(tmp_path / "run", {})
+    folder = RunFolder.make(tmp_path / "run", {})
     folder.write_json("summary.json", {"a": 1})
     with pytest.raises(TypeError):
         folder.write_json("summary.json", {"a": object()})

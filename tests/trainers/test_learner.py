@@ -11,7 +11,7 @@ from ls3_torchrl import LS3Agent
 from ls3_torchrl.baselines import AWACLoss, action_value, gaussian_actor
 from ls3_torchrl.modules import ValueEnsemble
 from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, TD1ValueLoss
-from ls3_torchrl.trainers import AuxiliaryLoss, Learner
+from ls3_torchrl.trainers import AuxiliaryLoss, DivergenceError, Learner, LearnerGroup
 from ls3_torchrl.trainers.learner import cooled_down, threads
 
 
@@ -217,3 +217,98 @@ def test_threads_are_put_back_even_when_the_work_fails():
         fail()
     assert inside == [before + 1]
     assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("stop", [1, 4, 9, 12])
+def test_a_phase_that_was_stopped_at_any_step_is_taken_up_there(recorder, stop):
+    whole, _ = td1_learner(0)
+    whole.logger, whole.cooldown = recorder, 0.5
+    whole.train(12, "Value")
+    first, generator = td1_learner(0)
+    kept = {}
+
+    def keep():
+        if first.steps == stop:
+            kept.update(state=first.state_dict(), draws=generator.get_state())
+            raise KeyboardInterrupt
+
+    first.cooldown, first.after_step = 0.5, keep
+    with pytest.raises(KeyboardInterrupt):
+        first.train(12, "Value")
+    second, later = td1_learner(1)
+    second.cooldown, second.logger = 0.5, type(recorder)()
+    later.set_state(kept["draws"])
+    second.load_state_dict(kept["state"])
+    second.train(12, "Value")
+    assert second.steps == 12
+    assert second.logger.rows == [row for row in recorder.rows if row[2] > stop]
+    for name, expected in whole.loss.state_dict().items():
+        assert torch.equal(second.loss.state_dict()[name], expected), name
+    second.train(3, "Value")  # the next phase starts at its beginning
+    assert second.steps == 15
+
+
+class _Poison(torch.autograd.Function):
+    """A loss that is finite, and a gradient that is not."""
+
+    @staticmethod
+    def forward(ctx, x):
+        return x
+
+    @staticmethod
+    def backward(ctx, grad):
+        return grad * float("nan")
+
+
+@pytest.mark.parametrize("where", ["loss", "gradient"])
+def test_divergence_stops_at_its_very_step_and_leaves_finite_weights_and_its_batch(where, monkeypatch):
+    learner, _ = td1_learner(0)
+    clean, calls = learner.compute_loss, []
+
+    def poisoned():
+        losses, value = clean()
+        calls.append(len(calls))
+        if len(calls) < 8:
+            return losses, value
+        return losses, value * float("nan") if where == "loss" else _Poison.apply(value)
+
+    monkeypatch.setattr(learner, "compute_loss", poisoned)
+    with pytest.raises(DivergenceError, match=r"Value diverged.*at step 7.*learning rate") as caught:
+        learner.train(20, "Value")
+    assert learner.steps == caught.value.step == 7
+    assert all(torch.isfinite(p).all() for p in learner.parameters)
+    assert caught.value.batch["latent"].shape == (16, 4)
+    assert all(torch.isfinite(m).all() for s in learner.optimizer.state.values() for m in s.values())
+
+
+def group_of_two(seed, after_step=None):
+    (one, draws), (two, more) = td1_learner(seed), td1_learner(seed + 10)
+    one.after_step = two.after_step = after_step
+    return LearnerGroup({"one": one, "two": two}), (draws, more)
+
+
+@pytest.mark.parametrize("stop", range(1, 13))
+def test_a_group_continues_with_the_learner_that_was_stopped(stop):
+    stages = [("one", 4, "One"), ("two", 5, "Two"), ("one", 3, "One again")]
+    whole, _ = group_of_two(0)
+    whole.train(stages)
+    calls, kept = [], {}
+
+    def keep():
+        calls.append(None)
+        if len(calls) == stop:
+            kept.update(state=first.state_dict(), draws=[generator.get_state() for generator in generators])
+            raise KeyboardInterrupt
+
+    first, generators = group_of_two(0, keep)
+    with pytest.raises(KeyboardInterrupt):
+        first.train(stages)
+    second, later = group_of_two(3)
+    for generator, state in zip(later, kept["draws"], strict=True):
+        generator.set_state(state)
+    second.load_state_dict(kept["state"])
+    second.train(stages)
+    for name, learner in whole.learners.items():
+        assert second.learners[name].steps == learner.steps
+        for key, expected in learner.loss.state_dict().items():
+            assert torch.equal(second.learners[name].loss.state_dict()[key], expected), (name, key)

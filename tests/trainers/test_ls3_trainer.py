@@ -1,5 +1,6 @@
 """LS³'s learners: which data each draws, what the options change, and that training continues where it stopped."""
 
+import contextlib
 import copy
 import pickle
 
@@ -192,6 +193,44 @@ def test_training_that_continues_from_its_state_ends_as_one_that_was_never_stopp
     for name in ("dynamics", "value", "safe_set", "constraint", "goal"):
         pairs = zip(getattr(whole.agent, name).parameters(), getattr(second.agent, name).parameters(), strict=True)
         assert all(torch.equal(a, b) for a, b in pairs), name
+
+
+@pytest.mark.parametrize("stop", [2, 4, 8, 17, 19, 20, 23, 33])
+def test_training_that_was_stopped_in_any_phase_is_taken_up_at_that_step(make_agent, filled, stop):
+    options = LS3Options(OfflineOptions(3, 3, 3, 3), OnlineOptions(3, 3, 3), OptimOptions(16, target_interval=2))
+    torch.manual_seed(5)
+    buffer = filled(make_agent())
+
+    def trainer(seed, after_step=None):
+        torch.manual_seed(seed)
+        return LS3Trainer(make_agent(), buffer, options, progress=False, after_step=after_step)
+
+    calls, kept = [], {}
+
+    def keep():
+        calls.append(None)
+        if len(calls) == stop:
+            kept.update(state=first.state_dict(), draws=torch.get_rng_state())
+            raise KeyboardInterrupt
+
+    whole, first, second = trainer(0), trainer(0, keep), trainer(1)
+    torch.manual_seed(9)
+    whole.train_offline()
+    whole.update()
+    torch.manual_seed(9)
+    with contextlib.suppress(KeyboardInterrupt):
+        first.train_offline()
+        first.update()
+    assert len(calls) == stop
+    second.load_state_dict(kept["state"])
+    torch.set_rng_state(kept["draws"])
+    if stop <= 18:
+        second.train_offline()
+    second.update()
+    for name, learner in whole.learners.items():
+        assert second.learners[name].steps == learner.steps, name
+        for key, expected in learner.loss.state_dict().items():
+            assert torch.equal(second.learners[name].loss.state_dict()[key], expected), (name, key)
 
 
 def test_states_under_keys_of_ones_own_train_as_pixels_do(episode, recorder):

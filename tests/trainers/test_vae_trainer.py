@@ -155,6 +155,39 @@ def test_training_that_continues_from_its_state_ends_as_one_that_was_never_stopp
         assert all(torch.equal(a, b) for a, b in pairs), half
 
 
+@pytest.mark.parametrize("stop", [1, 4, 6])
+def test_training_that_was_stopped_at_a_step_ends_as_one_that_was_not(make_agent, filled, episode, recorder, stop):
+    content = episode(7)
+    options = VAEOptions(**FAST | {"steps": 6}, unit_scale=True, schedule="onecycle")
+
+    def trainer(seed, **more):
+        torch.manual_seed(seed)
+        return VAETrainer(make_agent(), filled(content), options, progress=False, **more)
+
+    whole, kept = trainer(0, logger=recorder), {}
+
+    def keep():
+        if first.steps == stop:
+            kept.update(state=first.state_dict(), draws=torch.get_rng_state())
+            raise KeyboardInterrupt
+
+    torch.manual_seed(3)
+    whole.train()
+    first = trainer(0, after_step=keep)
+    torch.manual_seed(3)
+    with pytest.raises(KeyboardInterrupt):
+        first.train()
+    second = trainer(1, logger=type(recorder)())
+    second.load_state_dict(kept["state"])
+    torch.set_rng_state(kept["draws"])
+    second.train()
+    assert second.logger.rows == [row for row in recorder.rows if row[2] >= stop]
+    for half in ("encoder", "decoder"):
+        pairs = zip(getattr(whole.agent, half).parameters(), getattr(second.agent, half).parameters(), strict=True)
+        assert all(torch.equal(a, b) for a, b in pairs), half
+    assert torch.equal(second.buffer.transitions.storage[:]["loc"], whole.buffer.transitions.storage[:]["loc"])
+
+
 def test_training_again_once_it_has_ended_changes_nothing(make_agent, filled, episode):
     content = episode(7)
 

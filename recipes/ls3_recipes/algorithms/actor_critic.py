@@ -9,20 +9,17 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import SACLoss
-from torchrl.record.loggers import Logger
 
 from ls3_recipes.algorithms.baseline import ActorCriticSettings, Baseline
 from ls3_recipes.plots.plane import Field
 from ls3_torchrl.baselines import action_value, gaussian_actor
-from ls3_torchrl.data import Tag, TaggedReplayBuffer
-from ls3_torchrl.trainers import Learner
+from ls3_torchrl.data import Tag
+from ls3_torchrl.trainers import Learner, Stage
 
 
 class ActorCritic(Baseline):
     """A stochastic actor with a critic."""
 
-    #: Trains actor and critic together.
-    both: Learner
     draws_fields = True
     #: Taken off every reward.
     bonus = 0.0
@@ -37,12 +34,12 @@ class ActorCritic(Baseline):
         """Actor and critic."""
         return {"actor": build(gaussian_actor, initial_std=self.options.initial_std), "critic": build(action_value)}
 
-    def begin(self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int) -> None:
-        """Make the learners."""
-        super().begin(buffer, logger, horizon)
+    def make_learners(self, horizon: int) -> dict[str, Learner]:
+        """With the one that trains actor and critic together, ``"both"``."""
         self.steps_per_update = round(
             self.options.updates_per_step * horizon * self.settings.online.episodes_per_update
         )
+        return super().make_learners(horizon)
 
     def sample(self, tags: Iterable[Tag]) -> TensorDictBase:
         """Transitions with penalised rewards, and the ends that a critic should know of."""
@@ -55,13 +52,17 @@ class ActorCritic(Baseline):
         reached.set("done", over)
         return rows
 
+    def stages(self) -> list[Stage]:
+        """What an update trains: actor and critic together."""
+        return [("both", self.steps_per_update, "Actor and critic")]
+
     def update(self) -> None:
-        """Actor and critic together."""
-        self.both.train(self.steps_per_update, "Actor and critic")
+        """Learn from all data that the algorithm learns from."""
+        self.learners.train(self.stages())
 
     def fields(self, rows: TensorDictBase) -> dict[str, Field]:
         """The critic's value of what the actor would do."""
-        return {"Value min Q": Field(least_value(self.both.loss, rows), "viridis")}
+        return {"Value min Q": Field(least_value(self.learners.learners["both"].loss, rows), "viridis")}
 
 
 def least_value(loss: SACLoss, rows: TensorDictBase) -> Tensor:

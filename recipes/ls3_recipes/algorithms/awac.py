@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from torchrl.record.loggers import Logger
-
 from ls3_recipes.algorithms.actor_critic import ActorCritic
 from ls3_recipes.algorithms.baseline import ActorCriticSettings, BaselineSettings
 from ls3_recipes.options import as_dict
 from ls3_recipes.plots.style import Label
 from ls3_torchrl._checks import require_positive
 from ls3_torchrl.baselines import AWACLoss
-from ls3_torchrl.data import ALL_TAGS, TaggedReplayBuffer
+from ls3_torchrl.data import ALL_TAGS
+from ls3_torchrl.trainers import Learner
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,17 +50,17 @@ class AWAC(ActorCritic):
     settings_class = AWACSettings
     labels = {"awac": Label("AWAC", "#5b6fb5")}  # noqa: RUF012
 
-    def begin(self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int) -> None:
-        """Make the learners."""
-        super().begin(buffer, logger, horizon)
+    def make_learners(self, horizon: int) -> dict[str, Learner]:
+        """With that of actor and critic."""
         policy = self.settings.policy
         assert isinstance(policy, AWACPolicySettings)
+        learners = super().make_learners(horizon)
         loss = AWACLoss(self.networks["actor"], self.networks["critic"], temperature=policy.temperature)
         loss.make_value_estimator(gamma=as_dict(self.settings.buffer)["gamma"])
-        self.both = self.learner(["actor", "qvalue"], loss, lambda: self.sample(ALL_TAGS), tau=policy.tau)
+        both = self.learner(["actor", "qvalue"], loss, lambda: self.sample(ALL_TAGS), tau=policy.tau)
+        return learners | {"both": both}
 
     def phases(self) -> dict[str, Callable[[], None]]:
         """Actor and critic together, on all offline data."""
-        return super().phases() | {
-            "critic": lambda: self.both.train(self.options.critic_steps, "Actor and critic"),
-        }
+        stage = ("both", self.options.critic_steps, "Actor and critic")
+        return super().phases() | {"critic": lambda: self.learners.train([stage])}

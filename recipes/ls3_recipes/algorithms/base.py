@@ -70,8 +70,10 @@ class Algorithm(ABC):
             )
 
     @abstractmethod
-    def begin(self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int) -> None:
-        """Make the learners, on a buffer that holds the offline data."""
+    def begin(
+        self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int, after_step: Callable[[], object] | None = None
+    ) -> None:
+        """Make the learners, on a buffer that holds the offline data; ``after_step`` follows every gradient step."""
 
     @abstractmethod
     def phases(self) -> dict[str, Callable[[], None]]:
@@ -80,6 +82,18 @@ class Algorithm(ABC):
     @abstractmethod
     def update(self) -> None:
         """Learn from all data, after new episodes."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, optimisers, lagged networks and counters, in the middle of a phase or of an update as well."""
+
+    @abstractmethod
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue where :meth:`state_dict` was taken: the phase or update that was cut is to be called again."""
+
+    @abstractmethod
+    def encode(self) -> None:
+        """Fill the latents of the buffer again, as the VAE's training had done."""
 
     def describe(self, episodes: TensorDictBase) -> dict[str, float]:
         """Figures of the policy's own about episodes that it acted in, for the metrics."""

@@ -28,7 +28,7 @@ from ls3_torchrl._checks import require_at_least, require_choice, require_positi
 from ls3_torchrl.baselines import PixelFeatures, action_bounds
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.files import save_atomically
-from ls3_torchrl.trainers import Learner, VAETrainer
+from ls3_torchrl.trainers import Learner, LearnerGroup, VAETrainer
 
 FORMAT = "ls3_torchrl.comparison"
 VERSION = 1
@@ -167,19 +167,27 @@ class Baseline(Algorithm):
     def _seeing(self, policy: TensorDictModuleBase) -> TensorDictModuleBase:
         return policy if self.vae is None else TensorDictSequential(self.vae.encoder, policy)
 
-    def begin(self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int) -> None:
-        """Make the learner that clones."""
-        self.buffer, self.logger = buffer, logger
+    def begin(
+        self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int, after_step: Callable[[], object] | None = None
+    ) -> None:
+        """Make the learners."""
+        self.buffer = buffer
+        self.how: dict[str, Any] = {"logger": logger, "after_step": after_step}
+        self.vae_trainer = None if self.vae is None else VAETrainer(self.vae, buffer, self.settings.vae, **self.how)
+        self.learners = LearnerGroup(self.make_learners(horizon))
+
+    def make_learners(self, horizon: int) -> dict[str, Learner]:
+        """By name; here the one that clones, ``"cloning"``."""
         with warnings.catch_warnings():  # TorchRL's own class lacks an annotation that TorchRL looks for
             warnings.filterwarnings("ignore", "The name target_actor_network_params wasn't part of the annotations")
             cloning = BCLoss(self.networks["actor"], loss_function=self._distance)
-        self.cloning = self.learner("bc", cloning, lambda: self.sample(DEMONSTRATIONS))
+        return {"cloning": self.learner("bc", cloning, lambda: self.sample(DEMONSTRATIONS))}
 
     def learner(
         self, names: str | list[str], loss: LossModule, sample: Callable[[], TensorDictBase], **how: Any
     ) -> Learner:
         """A learner with the policy's learning rate."""
-        return Learner(names, loss, sample, lr=self.settings.policy.lr, logger=self.logger, **how)
+        return Learner(names, loss, sample, lr=self.settings.policy.lr, **self.how, **how)
 
     def _distance(self, predicted: Tensor, expert: Tensor) -> Tensor:
         """Squared distances of actions, in units of half their range."""
@@ -191,18 +199,38 @@ class Baseline(Algorithm):
 
     def phases(self) -> dict[str, Callable[[], None]]:
         """The VAE where one is read, and cloning."""
-        return ({} if self.vae is None else {"vae": self._train_vae}) | {"cloning": self._clone}
-
-    def _train_vae(self) -> None:
-        assert self.vae is not None
-        VAETrainer(self.vae, self.buffer, self.settings.vae, logger=self.logger).train()
+        return ({} if self.vae_trainer is None else {"vae": self.vae_trainer.train}) | {"cloning": self._clone}
 
     def _clone(self) -> None:
         with set_exploration_type(ExplorationType.DETERMINISTIC):  # the actor's mean
-            self.cloning.train(self.settings.policy.cloning_steps, "Cloning")
+            self.learners.train([("cloning", self.settings.policy.cloning_steps, "Cloning")])
 
     def update(self) -> None:
         """Nothing is learnt."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, optimisers, lagged networks and counters."""
+        vae = self.vae_trainer
+        return {
+            "networks": self.networks.state_dict(),
+            "vae": None if vae is None or vae.finished else vae.state_dict(),
+            "learners": self.learners.state_dict(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue where :meth:`state_dict` was taken."""
+        self.networks.load_state_dict(state_dict["networks"])
+        if self.vae_trainer is not None:
+            if state_dict["vae"] is None:
+                self.vae_trainer.finished = True
+            else:
+                self.vae_trainer.load_state_dict(state_dict["vae"])
+        self.learners.load_state_dict(state_dict["learners"])
+
+    def encode(self) -> None:
+        """Fill the latents of the buffer again, where networks read latents."""
+        if self.vae_trainer is not None:
+            self.vae_trainer.encode()
 
     def save(self, path: Path) -> Path:
         """Write the networks' weights."""

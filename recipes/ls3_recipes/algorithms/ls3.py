@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -131,21 +132,42 @@ class LS3(Algorithm):
         """The planner carries its last plan on from step to step."""
         env.append_transform(self.policy.make_tensordict_primer())
 
-    def begin(self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int) -> None:
+    def begin(
+        self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int, after_step: Callable[[], object] | None = None
+    ) -> None:
         """Make the learners of every equation."""
-        self.buffer, self.logger = buffer, logger
-        self.trainer = LS3Trainer(self.agent, buffer, self.settings.training, episode_length=horizon, logger=logger)
+        how: dict[str, Any] = {"logger": logger, "after_step": after_step}
+        self.vae = VAETrainer(self.agent, buffer, self.settings.vae, **how)
+        self.trainer = LS3Trainer(self.agent, buffer, self.settings.training, episode_length=horizon, **how)
 
     def phases(self) -> dict[str, Callable[[], None]]:
         """Equation (1), then the others on its latents."""
-        return {"vae": self._train_vae, "offline": self.trainer.train_offline}
-
-    def _train_vae(self) -> None:
-        VAETrainer(self.agent, self.buffer, self.settings.vae, logger=self.logger).train()
+        return {"vae": self.vae.train, "offline": self.trainer.train_offline}
 
     def update(self) -> None:
         """One update of all latent models."""
         self.trainer.update()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, optimisers, lagged networks and counters."""
+        return {
+            "agent": self.agent.state_dict(),
+            "vae": None if self.vae.finished else self.vae.state_dict(),
+            "learners": self.trainer.state_dict(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue where :meth:`state_dict` was taken."""
+        self.agent.load_state_dict(state_dict["agent"])
+        if state_dict["vae"] is None:
+            self.vae.finished = True
+        else:
+            self.vae.load_state_dict(state_dict["vae"])
+        self.trainer.load_state_dict(state_dict["learners"])
+
+    def encode(self) -> None:
+        """Fill the latents of the buffer again."""
+        self.vae.encode()
 
     def describe(self, episodes: TensorDictBase) -> dict[str, float]:
         """How often the planner relaxed the safe set or fell back."""

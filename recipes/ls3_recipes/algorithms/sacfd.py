@@ -12,7 +12,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import TransformedEnv
 from torchrl.objectives import DDPGLoss, SACLoss
-from torchrl.record.loggers import Logger
 
 from ls3_recipes.algorithms.actor_critic import ActorCritic
 from ls3_recipes.algorithms.baseline import DEMONSTRATIONS, ActorCriticSettings, BaselineSettings
@@ -22,6 +21,7 @@ from ls3_recipes.plots.style import Label
 from ls3_torchrl._checks import require_at_least, require_positive, require_unit_interval
 from ls3_torchrl.baselines import RecoveryPolicy, SafetyCritic, SafetyCriticLoss, deterministic_actor
 from ls3_torchrl.data import ALL_TAGS, Tag, TaggedReplayBuffer
+from ls3_torchrl.trainers import Learner, Stage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,15 +130,16 @@ class SACfD(ActorCritic):
             return offline
         return {tag: episodes.copy().set("task_action", episodes["action"]) for tag, episodes in offline.items()}
 
-    def begin(self, buffer: TaggedReplayBuffer, logger: Logger, horizon: int) -> None:
-        """Make the learners."""
-        super().begin(buffer, logger, horizon)
+    def make_learners(self, horizon: int) -> dict[str, Learner]:
+        """With those of the critic alone, of actor and critic, and with recovery of risk and recovery policy."""
+        learners = super().make_learners(horizon)
         policy, sac = self.settings.policy, self._sac_loss()
-        self.critic = self.learner("qvalue", sac, lambda: self.sample(DEMONSTRATIONS), tau=policy.tau)
         names = ["actor", "qvalue", *(["alpha"] if policy.learn_alpha else [])]
-        self.both = self.learner(names, sac, self._sample_wanted, tau=policy.tau)
-        if self.recovery:
-            self._make_recovery_learners()
+        learners |= {
+            "critic": self.learner("qvalue", sac, lambda: self.sample(DEMONSTRATIONS), tau=policy.tau),
+            "both": self.learner(names, sac, self._sample_wanted, tau=policy.tau),
+        }
+        return learners | (self._recovery_learners() if self.recovery else {})
 
     def _sac_loss(self) -> SACLoss:
         policy, gamma = self.settings.policy, as_dict(self.settings.buffer)["gamma"]
@@ -158,14 +159,16 @@ class SACfD(ActorCritic):
         loss.make_value_estimator(gamma=gamma)
         return loss
 
-    def _make_recovery_learners(self) -> None:
+    def _recovery_learners(self) -> dict[str, Learner]:
         policy = self.settings.policy
         risk = SafetyCriticLoss(self._safety_critic, super().act(), gamma=policy.risk.gamma)
-        self.risk = self.learner("safety", risk, lambda: self.sample(ALL_TAGS), tau=policy.tau)
         safer = DDPGLoss(self.networks["recovery"], self.networks["safety_critic"], delay_value=False)
         safer.set_keys(state_action_value="safety")
         safer.make_value_estimator(gamma=policy.risk.gamma)
-        self.safer = self.learner("actor", safer, lambda: self.sample(ALL_TAGS))
+        return {
+            "risk": self.learner("safety", risk, lambda: self.sample(ALL_TAGS), tau=policy.tau),
+            "safer": self.learner("actor", safer, lambda: self.sample(ALL_TAGS)),
+        }
 
     def _sample_wanted(self) -> TensorDictBase:
         """Of demonstrations and online episodes; with recovery, with the actions that the task's policy wanted."""
@@ -175,20 +178,18 @@ class SACfD(ActorCritic):
     def phases(self) -> dict[str, Callable[[], None]]:
         """Cloning, the critic of the demonstrations, and with recovery the risk in all data."""
         policy = self.settings.policy
-        phases = super().phases() | {"critic": lambda: self.critic.train(policy.critic_steps, "Critic")}
+        critic = ("critic", policy.critic_steps, "Critic")
+        phases = super().phases() | {"critic": lambda: self.learners.train([critic])}
         if self.recovery:
-            phases["risk"] = lambda: self._train_risk(policy.risk.offline_steps)
+            phases["risk"] = lambda: self.learners.train(self._risk_stages(policy.risk.offline_steps))
         return phases
 
-    def _train_risk(self, steps: int) -> None:
-        self.risk.train(steps, "Safety critic")
-        self.safer.train(steps, "Recovery policy")
+    def _risk_stages(self, steps: int) -> list[Stage]:
+        return [("risk", steps, "Safety critic"), ("safer", steps, "Recovery policy")]
 
-    def update(self) -> None:
-        """Actor and critic, from demonstrations and online episodes; risk from all data."""
-        super().update()
-        if self.recovery:
-            self._train_risk(self.steps_per_update)
+    def stages(self) -> list[Stage]:
+        """Actor and critic, from demonstrations and online episodes; with recovery, risk from all data."""
+        return super().stages() + (self._risk_stages(self.steps_per_update) if self.recovery else [])
 
     def describe(self, episodes: TensorDictBase) -> dict[str, float]:
         """How often the recovery policy took over."""

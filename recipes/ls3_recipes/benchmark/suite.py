@@ -23,7 +23,8 @@ from ls3_recipes.configuration import train_settings
 from ls3_recipes.console import console
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.options import as_dict
-from ls3_recipes.run_folder import RunFolder, require_new
+from ls3_recipes.run_files import require_new
+from ls3_recipes.run_folder import RunFolder
 from ls3_recipes.run_settings import require_path, require_threads
 from ls3_torchrl import LS3Agent
 from ls3_torchrl._checks import require_at_least, require_choice, require_positive
@@ -93,7 +94,7 @@ def run_benchmark(settings: BenchmarkSettings) -> dict:
     if settings.threads:
         torch.set_num_threads(settings.threads)
     presets = [_preset(settings.task, name) for name in settings.presets]
-    folder, bench = RunFolder(settings.output, as_dict(settings)), Bench(settings.seconds)
+    folder, bench = RunFolder.make(settings.output, as_dict(settings)), Bench(settings.seconds)
     peaks = {str(t).removeprefix("torch."): matmul_peak(bench, t, device) for t in (torch.float32, torch.bfloat16)}
     space = ls3_envs.make(settings.task, num_envs=1, seed=0).action_spec.space
     spec = Bounded(low=space.low[0], high=space.high[0], shape=space.low.shape[1:], device=device)

@@ -12,7 +12,7 @@ from ls3_recipes.configuration import register, run_command
 from ls3_recipes.console import console, percent_of
 from ls3_recipes.figures import episode_figures, summarise
 from ls3_recipes.rollout import collect_demonstrations
-from ls3_recipes.run_folder import require_new
+from ls3_recipes.run_files import require_new
 from ls3_recipes.run_settings import TaskSettings, require_path, require_seed
 from ls3_torchrl.data import save_episodes
 

@@ -21,7 +21,8 @@ from ls3_recipes.options import as_dict, defaults, errors_of
 from ls3_recipes.plots.run import save_video
 from ls3_recipes.plots.style import draw
 from ls3_recipes.rollout import make_env, run_episodes
-from ls3_recipes.run_folder import RunFolder, require_new
+from ls3_recipes.run_files import require_new
+from ls3_recipes.run_folder import RunFolder
 from ls3_recipes.run_settings import RunSettings, require_path, require_seed
 from ls3_torchrl._checks import require_at_least
 
@@ -118,7 +119,7 @@ def evaluate(settings: EvaluateSettings) -> dict:
     algorithm.prepare(env)
     file = Path(settings.run) / settings.agent
     algorithm.restore(file)
-    folder = RunFolder(settings.output, as_dict(settings) | {"planner": as_dict(trained).get("planner", {})})
+    folder = RunFolder.make(settings.output, as_dict(settings) | {"planner": as_dict(trained).get("planner", {})})
     episodes = run_episodes(env, algorithm.policy, what="Evaluation")
     summary: dict[str, Any] = {
         "algorithm": algorithm.name,

@@ -13,7 +13,7 @@ from matplotlib.backend_bases import FigureCanvasBase
 import ls3_envs
 from ls3_recipes.console import command_line, console
 from ls3_recipes.plots.gallery import plot_gallery
-from ls3_recipes.run_folder import require_writable
+from ls3_recipes.run_files import require_writable
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -14,7 +14,7 @@ from ls3_recipes.configuration import register, run_command
 from ls3_recipes.console import console
 from ls3_recipes.plots.report import check_alike, plot_report, read_run, rows_of
 from ls3_recipes.plots.style import draw
-from ls3_recipes.run_folder import require_new
+from ls3_recipes.run_files import require_new
 from ls3_recipes.run_settings import require_path
 
 #: How algorithms are shown, in the order of legend and table.

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 
 import ls3_envs  # noqa: F401  (before TorchRL, which imports MuJoCo: whatever MUJOCO_GL says)
 from ls3_recipes.algorithms import ALGORITHMS
-from ls3_recipes.configuration import run_command, settings_class_of
+from ls3_recipes.configuration import errors_in_one_line, run_command, settings_class_of, settings_of_run
+from ls3_recipes.interrupts import Interrupted
 from ls3_recipes.overrides import choices_of
 from ls3_recipes.protocol import run_experiment
 
@@ -19,9 +22,12 @@ Learn a task from images, safely.
 
   ls3 train [algorithm={"|".join(ALGORITHMS)}] [task={"|".join(choices_of("task"))}]
             [preset={"|".join(choices_of("preset"))}] [seed=N] [output=DIR] [KEY=VALUE ...]
+  ls3 train resume=DIR
 
 Collects demonstrations (or reads data=DIR), trains offline, improves online, evaluates, and leaves a folder with
 metrics, checkpoints, summary.json and pictures. With algorithm=sacfd recovery=true: SACfD+RRL.
+
+A run that was cut off goes on, to the same result as one that was not: with the same command, or with resume=DIR.
 
 Presets: cpu (minutes on two cores), paper (Table 1 to the letter), smoke (does everything run?)
 
@@ -42,8 +48,41 @@ def main(arguments: Sequence[str] | None = None, *, algorithm: str | None = None
     arguments = [*(sys.argv[1:] if arguments is None else arguments)]
     if algorithm is not None:
         arguments.insert(0, f"algorithm={algorithm}")
+    resumed = [argument for argument in arguments if argument.startswith("resume=")]
+    if resumed:
+        with _exit_code_of_signals(), errors_in_one_line("ls3 train"):
+            resume(resumed[-1].partition("=")[2], [argument for argument in arguments if argument not in resumed])
+        return
     try:
         settings = settings_class_of(arguments)
     except ValueError as error:
         raise SystemExit(f"ls3 train: {error}") from None
-    run_command("train", settings, run_experiment, arguments, help_text=help_text())
+    with _exit_code_of_signals():
+        run_command("train", settings, run_experiment, arguments, help_text=help_text())
+
+
+def resume(folder: str, others: Sequence[str] = ()) -> dict:
+    """Go on with a run that was cut off.
+
+    Args:
+        folder: of the run.
+        others: other arguments of the command line: there are none, since the run has its settings.
+
+    Raises:
+        ValueError: for other arguments.
+        FileNotFoundError: for a folder that holds no run.
+        FileExistsError: for a run that is finished or that another process is at.
+    """
+    if others:
+        raise ValueError(
+            f"resume={folder} goes on with the settings of that run, and takes no others; got {', '.join(others)}."
+        )
+    return run_experiment(replace(settings_of_run(folder), output=folder))
+
+
+@contextmanager
+def _exit_code_of_signals() -> Iterator[None]:
+    try:
+        yield
+    except Interrupted as error:
+        raise SystemExit(error.exit_code) from None

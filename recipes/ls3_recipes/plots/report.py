@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ls3_recipes.plots.style import INK, Label, grid, picture
-from ls3_recipes.run_folder import read_json, read_metrics
+from ls3_recipes.run_files import read_json, read_metrics
 
 #: How algorithms are shown, in the order of legend and table.
 Labels = Mapping[str, Label]

@@ -155,7 +155,7 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(recorder, encoder
         algorithm = parts(configure(name, "policy.batch_size=200", f"encoder={encoder}"))
         fill(algorithm, recorder, "success", "rand", "constraint", "online")
         for learner, tags in expected.items():
-            rows = getattr(algorithm, learner).sample()
+            rows = algorithm.learners.learners[learner].sample()
             assert set(rows["tag"].unique().tolist()) == tags, (name, learner)
             assert algorithm.observation in rows
             assert algorithm.observation in rows["next"]
@@ -165,7 +165,7 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(recorder, encoder
 def test_rewards_are_penalised_and_ends_are_as_set(recorder, zero_at_goal):
     algorithm = parts(configure("awac", "policy.batch_size=300", f"policy.zero_at_goal={zero_at_goal}"))
     fill(algorithm, recorder, "success")
-    rows = algorithm.both.sample()
+    rows = algorithm.learners.learners["both"].sample()
     violated = rows["next", "constraint"]
     assert violated.any()
     assert (rows["next", "reward"][violated] == -2.0).all()
@@ -178,8 +178,8 @@ def test_rewards_are_penalised_and_ends_are_as_set(recorder, zero_at_goal):
 def test_the_task_learns_what_it_wanted_and_the_safety_critic_what_was_done(recorder):
     algorithm = parts(configure("sacfd_rrl"))
     fill(algorithm, recorder, "success", "constraint")
-    assert (algorithm.both.sample()["action"] == 1.0).all()
-    assert (algorithm.risk.sample()["action"] == 0.0).all()
+    assert (algorithm.learners.learners["both"].sample()["action"] == 1.0).all()
+    assert (algorithm.learners.learners["risk"].sample()["action"] == 0.0).all()
     offline = algorithm.offline_data({Tag.SUCCESS: TensorDict({"action": torch.randn(2, 3, 2)}, [2, 3])})
     assert torch.equal(offline[Tag.SUCCESS]["task_action"], offline[Tag.SUCCESS]["action"])
 
@@ -216,7 +216,7 @@ def test_units_of_the_actions_change_no_value(recorder):
     for box, value in zip((Box, Small), target, strict=True):
         algorithm = parts(configure("sacfd", "policy.learn_alpha=true"), box())
         fill(algorithm, recorder, "success")
-        assert float(algorithm.both.loss.target_entropy) == pytest.approx(value, abs=1e-5)
+        assert float(algorithm.learners.learners["both"].loss.target_entropy) == pytest.approx(value, abs=1e-5)
 
 
 # --- health ---------------------------------------------------------------------------------------------------

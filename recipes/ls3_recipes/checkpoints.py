@@ -1,0 +1,143 @@
+"""The state of a run on disk, from which it continues: TorchRL's checkpoints, made safe against what ends a process."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, StateDictCheckpointAdapter
+
+from ls3_recipes.console import console
+
+#: Checkpoints kept: the newest, and the one before for when the newest is damaged.
+KEPT = 2
+#: Free bytes below which a write that failed is taken for one that found no room.
+_NO_ROOM = 16 * 2**20
+
+
+class Stateful(Protocol):
+    """What has a state."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state, as ``torch.load(weights_only=True)`` can read it."""
+
+    def load_state_dict(self, state_dict: dict[str, Any], /) -> Any:
+        """Take a state over."""
+
+
+class RunCheckpoints:
+    """Whole states of a run, the newest two, in files that are whole or not there.
+
+    TorchRL's :class:`~torchrl.checkpoint.CheckpointRotation` names, writes and removes them. Here they are forced to
+    the disk, what a killed process left behind is removed, a damaged file gives way to the one before it, and a full
+    disk is called by its name. Every file is a ZIP archive whose checksums are verified; no code in it is run.
+
+    Args:
+        folder: where they lie.
+
+    Example:
+        >>> import tempfile
+        >>> import torch
+        >>> net, other = torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)
+        >>> checkpoints = RunCheckpoints(tempfile.mkdtemp())
+        >>> checkpoints.save({"net": net})
+        >>> checkpoints.load({"net": other})
+        True
+        >>> bool((net.weight == other.weight).all())
+        True
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self._rotation = CheckpointRotation(self.folder, keep_last=KEPT, prefix="run")
+
+    def save(self, parts: Mapping[str, Stateful]) -> None:
+        """Write the state of all parts; the file before stays until this one is on the disk.
+
+        Raises:
+            OSError: when there is no room, naming the folder; what was saved before stays.
+        """
+        there = self._rotation.checkpoints()
+        step = int(there[-1].stem.rpartition("-")[2]) + 1 if there else 1
+        try:
+            path = self._rotation.save(_checkpoint(parts), step=step)
+            _sync(path)
+            _sync(self.folder)
+        except (OSError, RuntimeError) as error:
+            if _is_full(error, self.folder):
+                raise OSError(
+                    errno.ENOSPC,
+                    "The disk is full: the run's state could not be saved. The one saved before is whole; make room, "
+                    "then continue the run",
+                    str(self.folder),
+                ) from error
+            raise
+
+    def load(self, parts: Mapping[str, Stateful]) -> bool:
+        """Give all parts the newest state that is whole; ``False`` when there is none.
+
+        Raises:
+            ValueError: when there are files, and none is whole.
+        """
+        self.tidy()
+        damaged = []
+        for path in reversed(self._files()):
+            try:
+                _checkpoint(parts).load(path)
+            except Exception as error:  # whatever damage makes of a file
+                damaged.append(f"{path} cannot be read ({' '.join(str(error).split())[:200]})")
+                continue
+            for what in damaged:
+                console.print(f"[bold red]{what}[/bold red]; continuing from {path.name}, the one before.")
+            return True
+        if damaged:
+            raise ValueError(f"{'; '.join(damaged)}. No state of the run is whole: start it again in another folder.")
+        return False
+
+    def tidy(self) -> None:
+        """Remove what a killed process left in the middle of a save."""
+        for path in self.folder.glob(".run-*"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    def exist(self) -> bool:
+        """Whether there is a state to continue from."""
+        return bool(self._files())
+
+    def remove(self) -> None:
+        """Remove all: the run is finished."""
+        self.tidy()
+        for path in self._files():
+            path.unlink()
+
+    def _files(self) -> list[Path]:
+        """By name: also those whose beginning is damaged, which TorchRL passes over in silence."""
+        return sorted(self.folder.glob("run-*.torchrl"))
+
+
+def _checkpoint(parts: Mapping[str, Stateful]) -> Checkpoint:
+    # In memory maps, which are the default, a full disk ends the process with SIGBUS.
+    adapter = StateDictCheckpointAdapter(payload_format="torch")
+    checkpoint = Checkpoint(format="archive")
+    for name, part in parts.items():
+        checkpoint.register(name, part, adapter=adapter)
+    return checkpoint
+
+
+def _sync(path: Path) -> None:
+    """Force a file, or the names in a folder, to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _is_full(error: BaseException, folder: Path) -> bool:
+    """Whether a write failed for want of room; PyTorch's writer does not say."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return True
+    return isinstance(error, RuntimeError) and folder.is_dir() and shutil.disk_usage(folder).free < _NO_ROOM

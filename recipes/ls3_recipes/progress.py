@@ -1,0 +1,107 @@
+"""How far a run got: what is saved of it beside the algorithm's networks and the episodes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from torchrl.checkpoint import GlobalRNGState
+from torchrl.envs import TransformedEnv
+
+
+class Progress:
+    """Phases and updates that are done, and the time that each kind of work has taken.
+
+    Example:
+        >>> progress = Progress()
+        >>> with progress.timed("vae"):
+        ...     progress.phases.append("vae")
+        >>> other = Progress()
+        >>> other.load_state_dict(progress.state_dict())
+        >>> other.phases, sorted(other.seconds)
+        (['vae'], ['vae'])
+    """
+
+    def __init__(self) -> None:
+        #: Offline phases that are done.
+        self.phases: list[str] = []
+        #: Rounds of online episodes that are on the disk and in the buffer.
+        self.collected = 0
+        #: Updates that are done.
+        self.updated = 0
+        self._seconds: dict[str, float] = {}
+        self._running: dict[str, float] = {}
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Wall-clock seconds by kind of work, those of what is going on included."""
+        now, out = time.perf_counter(), dict(self._seconds)
+        for name, start in self._running.items():
+            out[name] = out.get(name, 0.0) + now - start
+        return out
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Add the block's seconds to those of a kind of work."""
+        self._running[name] = time.perf_counter()
+        yield
+        self._seconds = self.seconds
+        del self._running[name]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Counters and seconds."""
+        return {
+            "phases": list(self.phases),
+            "collected": self.collected,
+            "updated": self.updated,
+            "seconds": self.seconds,
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue where :meth:`state_dict` was taken."""
+        self.phases = list(state_dict["phases"])
+        self.collected, self.updated = state_dict["collected"], state_dict["updated"]
+        self._seconds = dict(state_dict["seconds"])
+
+
+class Worlds:
+    """The random streams of environments, from which their next episodes begin.
+
+    Args:
+        env: transforms on one of :mod:`ls3_envs`.
+    """
+
+    def __init__(self, env: TransformedEnv) -> None:
+        self._env = env
+
+    def state_dict(self) -> dict[str, Any]:
+        """As they stood before the episodes that are going on."""
+        return {"streams": self._env.base_env.random_state()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """The next reset begins those episodes again."""
+        self._env.base_env.set_random_state(state_dict["streams"])
+
+
+class HeldRandomState:
+    """Python's, NumPy's and PyTorch's random streams, which take up a loaded state when all else is made."""
+
+    def __init__(self) -> None:
+        self._streams = GlobalRNGState()
+        self._held: Mapping[str, Any] | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """The streams now."""
+        return self._streams.state_dict()
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Hold a state until :meth:`release`."""
+        self._held = state_dict
+
+    def release(self) -> None:
+        """Let the streams take up the state that is held, if one is."""
+        if self._held is not None:
+            self._streams.load_state_dict(self._held)
+            self._held = None

@@ -1,0 +1,144 @@
+"""Which folder a run writes to: a new one, or that of the same run, which was cut off."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from ls3_recipes.console import console
+from ls3_recipes.options import as_dict
+from ls3_recipes.run_files import read_json, read_yaml, require_new, require_writable
+from ls3_recipes.run_folder import RunFolder
+from ls3_recipes.run_settings import RunSettings
+from ls3_recipes.versions import FORMAT, VERSION, description
+
+#: Where runs go that are given no ``output``.
+RUNS = Path("runs")
+#: Settings that say where a run is, and not what it does.
+_PLACE = "output"
+
+
+def open_folder(settings: RunSettings) -> RunFolder:
+    """A new folder for a run, or the one in which the same run was cut off.
+
+    Without ``output``, a run below ``runs/`` with the same settings, the same code and the same packages: it ends in
+    the same bits as one that starts afresh, only sooner.
+
+    Raises:
+        FileExistsError: for an ``output`` that is no run, a finished one, one of other settings, or one that another
+            process is writing to.
+    """
+    wanted = as_dict(settings)
+    if settings.output is not None:
+        path = Path(settings.output)
+        if not path.exists():
+            return RunFolder.make(path, wanted)
+        require_same_run(path, wanted)
+        return reopen(path)
+    name = name_of(settings)
+    for path in sorted(RUNS.glob(f"{name}-*"), reverse=True):
+        folder = _continued(path, wanted)
+        if folder is not None:
+            return folder
+    return _make_new(f"{name}-{datetime.now():%Y%m%d-%H%M%S}", wanted)
+
+
+def name_of(settings: RunSettings) -> str:
+    """What a run without ``output`` is called, before the time."""
+    what = [settings.task.name, settings.preset, f"seed{settings.seed}"]
+    return "-".join(what if settings.algorithm == "ls3" else [settings.algorithm, *what])
+
+
+def require_place(settings: RunSettings) -> None:
+    """Refuse, before any work, a place in which :func:`open_folder` could not begin or go on.
+
+    Raises:
+        FileExistsError, ValueError: as there.
+    """
+    if settings.output is None:
+        require_writable(RUNS / "new", "output")
+    elif os.path.lexists(settings.output):
+        require_same_run(Path(settings.output), as_dict(settings))
+    else:
+        require_new(settings.output)
+
+
+def _make_new(name: str, wanted: Mapping[str, Any]) -> RunFolder:
+    """Two runs that start in the same second get folders of their own."""
+    number = 1
+    while True:
+        path = RUNS / (name if number == 1 else f"{name}-{number}")
+        try:
+            return RunFolder.make(path, {**wanted, _PLACE: str(path)})
+        except FileExistsError:
+            number += 1
+
+
+def _continued(path: Path, wanted: Mapping[str, Any]) -> RunFolder | None:
+    """The folder of an unfinished run that would do the same, unless another process is at it."""
+    try:
+        require_same_run(path, wanted)
+        if read_json(path / "versions.json") != description():
+            return None
+        return reopen(path)
+    except (OSError, ValueError):
+        return None
+
+
+def reopen(path: Path) -> RunFolder:
+    """The folder of an unfinished run.
+
+    Raises:
+        FileExistsError: while another process writes to it.
+    """
+    folder = RunFolder(path)
+    console.print(f"Continuing the run in [bold]{path}[/bold], which was cut off.")
+    there = read_json(path / "versions.json")
+    changed = [name for name, value in description().items() if there.get(name) != value]
+    if changed:
+        console.print(
+            f"[bold red]{', '.join(changed)} changed since it began[/bold red]: what follows need not be what an "
+            "uncut run would have done."
+        )
+    return folder
+
+
+def require_same_run(path: Path, wanted: Mapping[str, Any]) -> None:
+    """Raise ``FileExistsError`` for a folder that holds no unfinished run of these settings."""
+    if not (path / "config.yaml").is_file():
+        require_new(path)
+    there = read_yaml(path / "config.yaml")
+    different = list(_differences(there, wanted))
+    if different:
+        raise FileExistsError(
+            f"{path} holds a run of other settings: {'; '.join(different[:3])}. "
+            "Choose another output=DIR, or give the settings of that run to continue it."
+        )
+    require_unfinished(path)
+
+
+def require_unfinished(path: Path) -> None:
+    """Raise ``FileExistsError`` for a run that is finished, or that a version of old left, which kept no state."""
+    if (path / "summary.json").is_file() and not any((path / "checkpoints").glob("run-*")):
+        raise FileExistsError(
+            f"The run in {path} is finished, and no run overwrites another. Choose another output=DIR, or move it away."
+        )
+    about = read_json(path / "versions.json")
+    if (about.get("format"), about.get("version")) != (FORMAT, VERSION):
+        raise FileExistsError(
+            f"{path} was left by another version of this program, which kept no state to continue from. "
+            "Choose another output=DIR, or move it away."
+        )
+
+
+def _differences(there: Mapping[str, Any], wanted: Mapping[str, Any], where: str = "") -> Iterator[str]:
+    """Settings that differ; ``"auto"`` was decided when the run began."""
+    for key in sorted({*there, *wanted}):
+        one, other = there.get(key), wanted.get(key)
+        if isinstance(one, Mapping) and isinstance(other, Mapping):
+            yield from _differences(one, other, f"{where}{key}.")
+        elif one != other and other != "auto" and where + key != _PLACE:
+            yield f"{where}{key}={one!r} there, {other!r} here"

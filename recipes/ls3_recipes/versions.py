@@ -1,0 +1,46 @@
+"""What decides what a run does, beside its settings: code and packages."""
+
+from __future__ import annotations
+
+import platform
+from functools import lru_cache
+from hashlib import blake2b
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import ls3_envs
+import ls3_recipes
+import ls3_torchrl
+
+#: Of a run's folder.
+FORMAT = "ls3_recipes.run"
+VERSION = 2
+PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "mujoco", "mujoco-warp", "hydra-core", "ls3-torchrl")
+
+
+@lru_cache(maxsize=1)
+def code() -> str:
+    """A digest of all code and settings files that decide what a run does."""
+    digest = blake2b(digest_size=16)
+    for package in (ls3_torchrl, ls3_envs, ls3_recipes):
+        folder = Path(str(package.__file__)).parent
+        for path in sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".yaml")):
+            digest.update(f"{path.relative_to(folder)}\n".encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def description() -> dict[str, Any]:
+    """What ``versions.json`` of a run that starts now says."""
+    return {"format": FORMAT, "version": VERSION, "code": code(), **versions()}
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that decide what a run does."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # run from a clone that is not installed
+            found[name] = "not installed"
+    return found
