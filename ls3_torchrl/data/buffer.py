@@ -40,7 +40,8 @@ class TaggedReplayBuffer:
     ``trajs_per_batch``, or where a batch is whole episodes; see :meth:`extend`.
 
     Args:
-        capacity: transitions kept; the oldest are overwritten.
+        capacity: transitions that there is room for. Where it is full, the oldest online ones are overwritten; offline
+            ones that came before all online ones are kept.
         latent_dim: D.
         gamma: γ of the ``reward_to_go`` labels, and of what is learnt from them.
         continue_failures: label episodes that never reach the goal as if they went on for ever
@@ -61,14 +62,16 @@ class TaggedReplayBuffer:
 
     Raises:
         ValueError: for a capacity below 1, γ outside [0, 1], γ = 1 with ``continue_failures``, or a key that the buffer
-            needs for itself; in :meth:`add`, for episodes that cannot be understood: of several, none is stored then.
+            needs for itself; in :meth:`add`, for episodes that cannot be understood, or that there is no room for: of
+            several, none is stored then.
         TypeError: in :meth:`add`, for images of another dtype than uint8, or entries that are no tensors.
         KeyError: in :meth:`add`, for a missing key.
         RuntimeError: in :meth:`sample`, without encoder or without rows of the selection; in :meth:`encode` and
             :meth:`sample_frame_transitions`, when frames were overwritten.
 
     Warns:
-        DataWarning: in :meth:`add`, of what was converted, and once when offline data begin to be overwritten.
+        DataWarning: in :meth:`add`, of what was converted, and once when offline data that came after online ones are
+            overwritten.
 
     Example:
         >>> from ls3_torchrl.modules import PixelEncoder
@@ -197,33 +200,49 @@ class TaggedReplayBuffer:
         if self.success_tail is not None:
             tail = self.success_tail
             episodes = [e[: length_without_idle_end(e.get(keys.success), tail)] for e in episodes]
-        for episode in episodes:
-            self._store.require_room(len(episode))
+        self._require_room(episodes, [tag for _, tag in tagged])
         if episodes:
             self._require_as_stored(episodes[0])
         written = [
             self._rows_of(episode, tag) for episode, (_, tag) in zip(episodes, tagged, strict=True)
         ]  # before anything is written: the encoder may fail
-        self._warn_of_eviction(sum(len(rows) for _, rows in written))
-        indices = [self._store.write(frames, rows) for frames, rows in written]
+        indices = []
+        for (frames, rows), (_, tag) in zip(written, tagged, strict=True):
+            keep = tag != Tag.ONLINE and self._store.keeps_all
+            self._warn_of_eviction(len(rows))
+            indices.append(self._store.write(frames, rows))
+            if keep:
+                self._store.keep()
         for view in self._views.values():
             view.sampler.refresh()
         return torch.cat(indices) if indices else torch.zeros(0, dtype=torch.long)
 
+    def _require_room(self, episodes: list[TensorDictBase], tags: list[Tag]) -> None:
+        """Refuse episodes that are too long, and offline data that cannot all be kept."""
+        online = tags.index(Tag.ONLINE) if Tag.ONLINE in tags else len(tags)
+        offline = [len(episode) for episode in episodes[:online]] if self._store.keeps_all else []
+        there, steps = len(self), sum(offline)
+        if there + steps > self.capacity:
+            raise ValueError(
+                f"The offline data have {there + steps} transitions, of which none is overwritten, and the buffer has "
+                f"room for {self.capacity}. Raise capacity to at least that, and to more for online episodes."
+            )
+        self._store.require_room_for(offline, [len(episode) for episode in episodes[len(offline) :]])
+
     def _warn_of_eviction(self, steps: int) -> None:
-        """Say it, once, when rows of demonstrations are overwritten: what they alone show is forgotten."""
-        there, over = self.write_count, self.write_count + steps - self.capacity
-        if self._warned or over <= 0:
+        """Say it, once, when offline data that came after online episodes are overwritten."""
+        store = self.transitions
+        if self._warned or store.write_count + steps <= self.capacity:
             return
-        going = torch.arange(max(there - self.capacity, 0), min(over, there)) % self.capacity
-        tags = self.transitions.storage[going.to(self.device)]["tag"] if len(going) else torch.zeros(0)
+        rows = store.later(torch.tensor(store.cursor), torch.arange(steps))
+        tags = store.storage[rows[rows < len(store)].to(self.device)]["tag"]
         lost = {tag: int((tags == int(tag)).sum()) for tag in Tag if tag != Tag.ONLINE}
-        if any(lost.values()) or over > there:
+        if any(lost.values()):
             self._warned = True
             told = ", ".join(f"{count} of {tag.name.lower()}" for tag, count in lost.items() if count)
             warnings.warn(
-                f"A buffer of {self.capacity} transitions is full and overwrites its oldest, offline data among them: "
-                f"{told or f'{over - there} of those that are being added'}. Give it a capacity for all to come.",
+                f"A buffer of {self.capacity} transitions is full and overwrites its oldest, offline data that were "
+                f"added after online episodes among them: {told}. Add offline data first, or give it more capacity.",
                 DataWarning,
                 stacklevel=4,
             )
@@ -309,7 +328,9 @@ class TaggedReplayBuffer:
         view = self._views.get(selection)
         if view is None:
             view = self._views[selection] = TensorDictReplayBuffer(
-                storage=self.transitions.storage, sampler=TagSampler(selection), writer=ImmutableDatasetWriter()
+                storage=self.transitions.storage,
+                sampler=TagSampler(selection, later=self.transitions.later),
+                writer=ImmutableDatasetWriter(),
             )
         return view
 
@@ -363,8 +384,9 @@ class TaggedReplayBuffer:
         first = view.sample(count)
         if steps == 1:
             return first, first
-        row = first.get("index").reshape(count, 1) + torch.arange(steps, device=first.get("index").device)
-        return first, view.storage[row.flatten() % self.capacity]
+        index = first.get("index").reshape(count, 1)
+        row = self.transitions.later(index, torch.arange(steps, device=index.device))
+        return first, view.storage[row.flatten()]
 
     def sample_frame_transitions(
         self, batch_size: int, selection: RowSelection | None = None, **filters: Any

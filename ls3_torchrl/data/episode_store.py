@@ -1,8 +1,8 @@
-"""Observations and the transitions between them, in two rings that keep together."""
+"""Observations and the transitions between them, in two stores that keep together."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ class EpisodeStore:
     number of their first one under ``frame``.
 
     Args:
-        capacity: transitions kept; the oldest are overwritten.
+        capacity: transitions that there is room for; the oldest are overwritten, but not those of :meth:`keep`.
         frame_capacity: frames kept; ``None`` keeps at least those of all transitions kept: room for episodes of 16
             steps, and more as soon as there are shorter ones.
         scratch_dir: memory-map both rings in the folders ``frames`` and ``transitions`` below this one.
@@ -58,7 +58,7 @@ class EpisodeStore:
         self.frames = RowStore(room, folder=folders[0], device=device)
         self.transitions = RowStore(capacity, folder=folders[1], device=device)
         self._frames_written = 0
-        # Frame number n lies in slot (n - shift) % frame_capacity.
+        # The ring of frames begins with the one whose number is its slot plus this.
         self._shift = 0
 
     @property
@@ -66,13 +66,38 @@ class EpisodeStore:
         """Frames that there is room for now."""
         return self.frames.capacity
 
-    def require_room(self, steps: int) -> None:
-        """Raise ``ValueError`` when an episode of so many steps is too long."""
-        if steps + 1 > self.frame_capacity or steps > self.capacity:
+    def require_room_for(self, kept: Iterable[int], others: Iterable[int]) -> None:
+        """Raise ``ValueError`` for an episode that is too long for what may be overwritten.
+
+        Args:
+            kept: lengths of episodes that will be kept, in their order.
+            others: lengths of episodes that come after them.
+        """
+        held, held_frames = self.transitions.kept, self.frames.kept
+        for steps in kept:
+            self._require_room(steps, held, held_frames)
+            held, held_frames = held + steps, held_frames + steps + 1
+        for steps in others:
+            self._require_room(steps, held, held_frames)
+
+    def _require_room(self, steps: int, held: int, held_frames: int) -> None:
+        too_many_frames = not self._grows and steps + 1 > self.frame_capacity - held_frames
+        if steps > self.capacity - held or too_many_frames:
+            offline = f", of which {held} and {held_frames} hold offline data, which are kept" if held else ""
             raise ValueError(
                 f"An episode of {steps} steps does not fit a buffer of {self.capacity} transitions and "
-                f"{self.frame_capacity} frames. Raise capacity."
+                f"{self.frame_capacity} frames{offline}. Raise {'frame_capacity' if too_many_frames else 'capacity'}."
             )
+
+    @property
+    def keeps_all(self) -> bool:
+        """Whether :meth:`keep` was called after all that was written."""
+        return self.transitions.kept == self.transitions.write_count
+
+    def keep(self) -> None:
+        """Never overwrite what was written so far."""
+        self.frames.keep()
+        self.transitions.keep()
 
     def write(self, frames: TensorDictBase, rows: TensorDictBase) -> Tensor:
         """Write an episode's frames ``[T + 1]`` and transitions ``[T]``; returns rows, int64 ``[T]``."""
@@ -85,12 +110,16 @@ class EpisodeStore:
 
     def _make_room(self, steps: int) -> None:
         """Let the ring of frames grow where an episode would overwrite frames of transitions that stay."""
-        written = self.transitions.write_count
-        oldest = max(written + steps - self.capacity, 0)  # number of the oldest transition that stays
-        if not self._grows or oldest >= written:
+        written, kept = self.transitions.write_count, self.transitions.kept
+        # Number of the oldest transition that stays, of those that may be overwritten.
+        oldest = kept + max(written + steps - self.capacity, 0)
+        if not self._grows:
             return
-        frame = int(self.transitions.storage[oldest % self.capacity]["frame"])
-        needed = self._frames_written + steps + 1 - frame
+        frame = self._frames_written
+        if oldest < written:
+            slot = self.transitions.later(torch.tensor(kept), oldest - kept)
+            frame = int(self.transitions.storage[slot]["frame"])
+        needed = self.frames.kept + self._frames_written + steps + 1 - frame
         if needed > self.frame_capacity:
             self._shift = self._frames_written - len(self.frames)
             # Two frames for each transition are enough even where all episodes have one step.
@@ -102,14 +131,17 @@ class EpisodeStore:
         Raises:
             RuntimeError: when they were overwritten.
         """
-        oldest, first = self._frames_written - len(self.frames), int(frame.min())
-        if first < oldest:
+        frame, kept = frame.flatten(), self.frames.kept
+        oldest = self._frames_written - len(self.frames) + kept  # of those that may be overwritten
+        gone = frame[(frame >= kept) & (frame < oldest)]
+        if len(gone):
+            first = int(gone.min())
             raise RuntimeError(
                 f"Frames older than number {oldest} were overwritten, but transitions still need frame {first}. Give "
                 f"the buffer a larger frame_capacity (now {self.frame_capacity}), or None for as many as are needed."
             )
-        slot = (frame.flatten() - self._shift) % self.frame_capacity
-        return slot, (slot + 1) % self.frame_capacity
+        slot = torch.where(frame < kept, frame, self.frames.later(frame.clamp(min=kept), -self._shift))
+        return slot, self.frames.later(slot, 1)
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of both rings and the counters."""

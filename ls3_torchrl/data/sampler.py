@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -24,6 +25,8 @@ class TagSampler(Sampler):
         selection: which rows are drawn. With ``steps`` K, these are the first rows of the stretches.
         tag_key: where the rows keep their tag, uint8 ``[1]``.
         steps_left_key: where the rows keep how many steps their episode has from them on, int64 ``[1]``.
+        later: gives of row numbers ``[n]`` and a number of steps those written so many steps later; ``None`` for rows
+            that follow one another, the first after the last.
 
     Raises:
         RuntimeError: in :meth:`sample`, when the selection admits no row.
@@ -40,9 +43,15 @@ class TagSampler(Sampler):
     """
 
     def __init__(
-        self, selection: RowSelection, *, tag_key: NestedKey = "tag", steps_left_key: NestedKey = "steps_left"
+        self,
+        selection: RowSelection,
+        *,
+        tag_key: NestedKey = "tag",
+        steps_left_key: NestedKey = "steps_left",
+        later: Callable[[Tensor, int], Tensor] | None = None,
     ) -> None:
         super().__init__()
+        self._later = later
         self.selection = RowSelection.of(selection, {})
         self.tag_key, self.steps_left_key = tag_key, steps_left_key
         self._rows: Tensor | None = None
@@ -67,8 +76,10 @@ class TagSampler(Sampler):
             found &= content.get(self.steps_left_key).flatten() >= steps
         if selection.without is not None:
             out = content.get(selection.without).flatten()
-            for step in range(steps):  # an episode's rows follow one another, over the storage's end too
-                found &= ~out.roll(-step)
+            index = torch.arange(len(out), device=out.device)
+            for step in range(steps):
+                after = index + step if self._later is None else self._later(index, step)
+                found &= ~out[after % len(out)]
         return found.nonzero().flatten()
 
     def _parts(self, storage: Storage) -> list[Tensor]:

@@ -1,4 +1,4 @@
-"""A TorchRL replay buffer whose ring of rows can grow, be memory-mapped, and be saved without its unused room."""
+"""A TorchRL replay buffer that keeps its first rows, whose ring of later ones can grow, be memory-mapped and saved."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Dump(NamedTuple):
 
 
 class RowStore(TensorDictReplayBuffer):
-    """Rows in a ring: where it is full, the oldest are overwritten.
+    """Rows that are kept, and a ring behind them: where it is full, its oldest rows are overwritten.
 
     ``state_dict`` and ``dumps`` hold the rows that there are and not the room for others, and ``loads`` reads no
     pickles; TorchRL's own save the whole room. Restored rows lie where they lay, so that equal random draws find equal
@@ -62,11 +62,17 @@ class RowStore(TensorDictReplayBuffer):
         >>> store.grow(4)
         >>> store.storage[:]["x"].flatten().tolist()
         [1, 2]
+        >>> store.keep()
+        >>> _ = store.extend(TensorDict({"x": torch.arange(3, 6).unsqueeze(-1)}, [3]))
+        >>> store.storage[:]["x"].flatten().tolist()
+        [1, 2, 5, 4]
     """
 
     def __init__(self, capacity: int, *, folder: str | Path | None = None, device: torch.device | str = "cpu") -> None:
         self._folder = None if folder is None else Path(folder)
         self._device = torch.device(device)
+        #: Rows at the beginning that are never overwritten.
+        self.kept = 0
         super().__init__(
             storage=self._make_storage(capacity), sampler=RandomSampler(), writer=TensorDictRoundRobinWriter()
         )
@@ -94,22 +100,53 @@ class RowStore(TensorDictReplayBuffer):
             (self._folder / _SCRATCH).write_text(
                 "A replay buffer's memory while it is in use; it can be removed.\n", encoding="utf-8"
             )
-        # Else a store that is first written under inference_mode() could never be written outside of it.
-        with torch.inference_mode(False), torch.no_grad():
-            return super().extend(rows.detach(), update_priority=update_priority)
+        written, rows = [], rows.detach()
+        if len(rows) and self.kept == self.capacity:
+            raise RuntimeError(f"All {self.capacity} rows are kept, and none may be overwritten. Make a larger store.")
+        while len(rows):
+            room = self.capacity - self.cursor
+            # Else a store that is first written under inference_mode() could never be written outside of it.
+            with torch.inference_mode(False), torch.no_grad():
+                written.append(super().extend(rows[:room], update_priority=update_priority))
+            if self.cursor == 0:  # it came to the end
+                self._set_writer(self.kept, self.write_count)
+            rows = rows[room:]
+        return torch.cat(written) if written else torch.zeros(0, dtype=torch.long)
+
+    def keep(self) -> None:
+        """Never overwrite the rows that there are; those to come are a ring behind them.
+
+        Raises:
+            RuntimeError: when rows were overwritten already, and the oldest are not the first.
+        """
+        if self.write_count > self.capacity:
+            raise RuntimeError("Rows were overwritten already. Call keep() before the store is full.")
+        self.kept = len(self)
+        if self.cursor == 0:
+            self._set_writer(self.kept % self.capacity, self.write_count)
+
+    def later(self, index: Tensor, steps: Tensor | int) -> Tensor:
+        """Where the rows lie that were written ``steps`` after those of an index; within an episode, or nowhere."""
+        ring = max(self.capacity - self.kept, 1)
+        there = index + steps
+        return torch.where(index < self.kept, there, self.kept + (there - self.kept) % ring)
+
+    def _set_writer(self, cursor: int, write_count: int) -> None:
+        self.writer.load_state_dict({"_cursor": cursor, "_write_count": write_count})
 
     def grow(self, capacity: int) -> None:
-        """Make room for more rows: from the oldest on they lie in their order, the first one at 0."""
-        old, count, start = self.storage, len(self), self.cursor if len(self) == self.capacity else 0
-        written = self.write_count
+        """Make room for more rows; those of the ring then lie in their order behind those that are kept."""
+        old, count, kept, written = self.storage, len(self), self.kept, self.write_count
+        start = self.cursor - kept if count == self.capacity else 0
+        ring = max(count - kept, 1)
         self.set_storage(self._make_storage(capacity))
         self.set_writer(TensorDictRoundRobinWriter())
         # A memory-mapped store writes to the folder that it reads from: its old files, although removed, stay readable
         # until the old storage is let go.
         for begin in range(0, count, _CHUNK):
-            rows = torch.arange(begin, min(begin + _CHUNK, count), device=self._device) + start
-            self.extend(old[rows % count])
-        self.writer.load_state_dict({"_cursor": count % capacity, "_write_count": written})
+            rows = torch.arange(begin, min(begin + _CHUNK, count), device=self._device)
+            self.extend(old[torch.where(rows < kept, rows, kept + (rows - kept + start) % ring)])
+        self._set_writer(count if count < capacity else kept, written)
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of the rows and the ring's counters, which ``torch.load(weights_only=True)`` can read."""
@@ -170,6 +207,7 @@ class RowStore(TensorDictReplayBuffer):
         return {
             "capacity": self.capacity,
             "count": len(self),
+            "kept": self.kept,
             "cursor": self.cursor,
             "write_count": self.write_count,
         }
@@ -178,13 +216,15 @@ class RowStore(TensorDictReplayBuffer):
         """Take over rows and counters."""
         rows, counters = dump
         self.empty()
+        self.kept = 0
         if counters["capacity"] != self.capacity:
             self.set_storage(self._make_storage(counters["capacity"]))
             self.set_writer(TensorDictRoundRobinWriter())
         for start in range(0, counters["count"], _CHUNK):
             assert rows is not None
             self.extend(rows[start : start + _CHUNK])
-        self.writer.load_state_dict({"_cursor": counters["cursor"], "_write_count": counters["write_count"]})
+        self.kept = counters.get("kept", 0)  # of an earlier version: all was one ring
+        self._set_writer(counters["cursor"], counters["write_count"])
 
 
 def _require_rows(found: dict[tuple[str, ...], Tensor], count: int, path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,6 +13,7 @@ from typing import Any, Protocol
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, StateDictCheckpointAdapter
 
 from ls3_recipes.console import console
+from ls3_recipes.interrupts import Interrupts
 
 #: Checkpoints kept: the newest, and the one before for when the newest is damaged.
 KEPT = 2
@@ -116,6 +118,41 @@ class RunCheckpoints:
     def _files(self) -> list[Path]:
         """By name: also those whose beginning is damaged, which TorchRL passes over in silence."""
         return sorted(self.folder.glob("run-*.torchrl"))
+
+
+class RunState:
+    """The parts of a run that continues: saved when something is done, and by the clock while something goes on.
+
+    Args:
+        checkpoints: where to.
+        parts: all that decides what the run will do.
+        interrupts: what asks it to stop.
+        minutes: between the saves of :meth:`after_step`.
+    """
+
+    def __init__(
+        self, checkpoints: RunCheckpoints, parts: Mapping[str, Stateful], interrupts: Interrupts, minutes: float
+    ) -> None:
+        self._checkpoints, self._parts, self._interrupts = checkpoints, parts, interrupts
+        self._seconds = 60.0 * minutes
+        self._saved = time.monotonic()
+
+    def save(self) -> None:
+        """Save now; a signal that comes meanwhile waits."""
+        with self._interrupts.deferred():
+            self._checkpoints.save(self._parts)
+        self._saved = time.monotonic()
+
+    def after_step(self) -> None:
+        """Save when it is time, and leave when a signal waits."""
+        if self._interrupts.pending or time.monotonic() - self._saved > self._seconds:
+            self._checkpoints.save(self._parts)
+            self._saved = time.monotonic()
+            self._interrupts.check()
+
+    def load(self) -> bool:
+        """Take up the newest state that is whole; ``False`` when there is none."""
+        return self._checkpoints.load(self._parts)
 
 
 def _checkpoint(parts: Mapping[str, Stateful]) -> Checkpoint:

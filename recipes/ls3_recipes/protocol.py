@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import shutil
-import time
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from ls3_recipes.algorithms import ALGORITHMS
-from ls3_recipes.checkpoints import Stateful
+from ls3_recipes.checkpoints import RunState, Stateful
 from ls3_recipes.console import console, print_summary
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.figures import Figures, best_update, episode_figures, means_of, summarise
 from ls3_recipes.interrupts import Interrupts
+from ls3_recipes.offline_data import Offline, collected_data, given_data
 from ls3_recipes.plots.run import pictures_of_run
 from ls3_recipes.plots.style import draw
 from ls3_recipes.progress import HeldRandomState, Progress, Worlds
 from ls3_recipes.resume import open_folder, require_place
-from ls3_recipes.rollout import collect_demonstrations, make_env, run_episodes, tick, whole_episodes
+from ls3_recipes.rollout import make_env, run_episodes, tick, whole_episodes
 from ls3_recipes.run_settings import RunSettings, decided
 from ls3_recipes.together import require_room, require_tools
-from ls3_torchrl.data import Tag, check_datasets, load_episodes, save_episodes
+from ls3_torchrl.data import Tag, load_episodes, save_episodes
 from ls3_torchrl.files import save_atomically, save_json_atomically
 from ls3_torchrl.trainers import DivergenceError
 from ls3_torchrl.trainers.learner import log_scalars
@@ -30,7 +30,6 @@ from ls3_torchrl.trainers.progress import progress_bar
 
 #: Of the online episodes, what figures and pictures need beyond what is learnt from.
 _KEPT = ("state", ("next", "state"), ("next", "done"))
-Offline = dict[Tag, TensorDictBase]
 
 
 def run_experiment(settings: RunSettings) -> dict:
@@ -99,75 +98,41 @@ class Experiment:
         self.algorithm = ALGORITHMS[settings.algorithm](settings, self.env, self.device)
         self.algorithm.prepare(self.env)
         self.buffer = self.algorithm.make_buffer(self.device)
-        self.offline: Offline = self._given_data() if settings.data else {}
+        self.offline: Offline = {}
+        if settings.data is not None:
+            needs, name = self.algorithm.needs, self.algorithm.name
+            self.offline = given_data(settings.data, settings.task, self.env.action_spec, needs, name)
         require_room(settings, self.offline, self.horizon)
         self.online: list[Figures] = []
         self.tracks: list[torch.Tensor] = []
         self.progress = Progress()
         self.random = HeldRandomState()
-        self._saved = time.monotonic()
-
-    def _given_data(self) -> Offline:
-        """The offline data that the settings name."""
-        assert self.settings.data is not None
-        offline = load_episodes(self.settings.data, task=self.settings.task.name)
-        for tag in self.algorithm.needs:
-            if tag not in offline:
-                raise ValueError(
-                    f"{self.settings.data} has no {tag.name.lower()} episodes, which {self.algorithm.name} needs. "
-                    "Collect them first."
-                )
-        try:
-            check_datasets(offline, action_spec=self.env.action_spec)
-        except (ValueError, TypeError, KeyError) as error:
-            raise type(error)(f"data={self.settings.data}: {error}") from error
-        return offline
-
-    @property
-    def _parts(self) -> dict[str, Stateful]:
-        """What a run continues from: with the episodes on the disk, all that decides what it will do."""
-        return {
-            "progress": self.progress,
-            "worlds": self._worlds,
-            "log": self.folder.logger,
-            "random": self.random,
-            "algorithm": self.algorithm,
-        }
-
-    def _save(self) -> None:
-        with self.interrupts.deferred():
-            self.folder.states.save(self._parts)
-            self._saved = time.monotonic()
-
-    def _after_step(self) -> None:
-        """Save now and then, and when asked to stop."""
-        if self.interrupts.pending or time.monotonic() - self._saved > 60.0 * self.settings.checkpoint_minutes:
-            self.folder.states.save(self._parts)
-            self._saved = time.monotonic()
-            self.interrupts.check()
 
     def start(self) -> None:
         """Make the run's folder, or go back to the one in which it was cut off."""
         self.folder = open_folder(self.settings)
-        self._worlds = Worlds(self.env)
+        parts: dict[str, Stateful] = {
+            "progress": self.progress,
+            "worlds": Worlds(self.env),
+            "log": self.folder.logger,
+            "random": self.random,
+            "algorithm": self.algorithm,
+        }
+        self.state = RunState(self.folder.states, parts, self.interrupts, self.settings.checkpoint_minutes)
 
     def collect(self) -> None:
         """Collect the demonstrations, unless they are there, and fill the buffer."""
-        task, path = self.settings.task, self.folder.path / "demonstrations"
+        settings, path = self.settings, self.folder.path / "demonstrations"
         with self.progress.timed("demonstrations"):
-            if not self.offline and not path.exists():
-                with torch.random.fork_rng():  # what is learnt does not depend on whether the data were there already
-                    collected = collect_demonstrations(task, self.seed["demonstrations"])
-                save_episodes(collected, path, task=task.name, seed=self.settings.seed)
             if not self.offline:
-                self.offline = load_episodes(path)  # from the disk: there may be more than memory
+                self.offline = collected_data(path, settings.task, self.seed["demonstrations"], settings.seed)
             for tag, episodes in self.algorithm.offline_data(self.offline).items():
                 self.buffer.add(episodes, tag)
-        self.algorithm.begin(self.buffer, self.folder.logger, self.horizon, self._after_step)
+        self.algorithm.begin(self.buffer, self.folder.logger, self.horizon, self.state.after_step)
 
     def resume(self) -> None:
         """Take up the state that was saved last, and the episodes that were collected until then."""
-        if not self.folder.states.load(self._parts):
+        if not self.state.load():
             self.folder.logger.restart()
             return
         if "vae" in self.progress.phases:
@@ -186,7 +151,7 @@ class Experiment:
                     with self.progress.timed(phase):
                         train()
                     self.progress.phases.append(phase)
-                    self._save()
+                    self.state.save()
         if self.progress.collected == 0:
             self.algorithm.save(self.folder.agent(0))
 
@@ -213,6 +178,7 @@ class Experiment:
                     self.algorithm.update()
                 self.algorithm.save(self.folder.agent(update))
                 self.progress.updated = update
+                self.state.save()
         ticking.remove()
         bar.close()
 
@@ -235,7 +201,7 @@ class Experiment:
         self._record(update, episodes)
         self.buffer.add(kept, Tag.ONLINE)
         self.progress.collected = update
-        self._save()
+        self.state.save()
 
     def _record(self, update: int, episodes: TensorDictBase) -> None:
         """Tell how the episodes of a round went."""

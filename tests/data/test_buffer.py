@@ -166,7 +166,7 @@ def test_frames_match_rows_of_episodes_added_after_encoding(scratch):
 def test_both_rings_wrap_round_and_keep_images_labels_and_tags_together(scratch):
     camera = Camera()
     buffer = TaggedReplayBuffer(10, latent_dim=D, gamma=0.5, frame_capacity=14, scratch_dir=scratch)
-    buffer.add(camera.shoot(4), "success")  # frames 0 to 4
+    buffer.add(camera.shoot(4), "online")  # frames 0 to 4
     buffer.add(camera.shoot(4, success=[3]), "rand")  # 5 to 9
     buffer.encode(reading_encoder())
     buffer.add(camera.shoot(4, success=[0]), "online")  # 10 to 14: both stores write over their oldest
@@ -180,13 +180,98 @@ def test_both_rings_wrap_round_and_keep_images_labels_and_tags_together(scratch)
     rows = buffer.transitions.storage[:]
     by_frame = dict(zip(rows["action"][:, 0].int().tolist(), range(10), strict=True))
     order = [by_frame[number] for number in left]
-    assert rows["tag"].flatten()[order].tolist() == [0, 0, 1, 1, 1, 1, 3, 3, 3, 3]
+    assert rows["tag"].flatten()[order].tolist() == [3, 3, 1, 1, 1, 1, 3, 3, 3, 3]
     assert rows["in_success"].flatten()[order].tolist() == [False] * 2 + [True] * 5 + [False] * 3
     expected = [-1.5, -1.0, -1.75, -1.5, -1.0, 0.0, -0.875, -1.75, -1.5, -1.0]
     assert rows["reward_to_go"].flatten()[order].tolist() == expected
-    assert [buffer.count(tags=[tag]) for tag in Tag] == [2, 4, 0, 4]
+    assert [buffer.count(tags=[tag]) for tag in Tag] == [0, 4, 0, 6]
     shown = buffer.frames.storage[:]["pixels"][:, 0, 0, 0]
     assert sorted(shown.tolist()) == list(range(1, 15))
+
+
+def test_offline_data_stay_while_online_episodes_come_and_go(scratch):
+    camera = Camera()
+    buffer = TaggedReplayBuffer(12, latent_dim=D, scratch_dir=scratch)
+    buffer.add(camera.shoot(2, success=[1]), "success")  # frames 0 to 2
+    buffer.encode(reading_encoder())
+    buffer.add(camera.shoot(3), "constraint")  # 3 to 6
+    for round_ in range(30):
+        buffer.add(camera.shoot(3), "online")
+        newest = [camera.frame - 4 * age + step for age in range(min(round_ + 1, 3)) for step in (-4, -3, -2)]
+        # Seven transitions of online episodes: the last two whole, and one of the episode before.
+        assert_rows_show_their_frames(buffer, [0, 1, 3, 4, 5, *sorted(newest)[-7:]])
+    assert [buffer.count(tags=[tag]) for tag in Tag] == [2, 0, 3, 7]
+    pairs = buffer.sample(200, steps=2)["action"][..., 0]
+    assert torch.equal(pairs[:, 1], pairs[:, 0] + 1)
+    assert {0, 3, 4} < set(pairs[:, 0].int().tolist())
+    # Those that begin before a violation, which follows frames 0, 3, 6, …, are left out over the ring's end as well.
+    safe = buffer.sample(200, steps=2, without="after_violation")["action"][..., 0].int()
+    assert not any(buffer.transitions.storage[:]["after_violation"][rows_of(buffer, safe.flatten())])
+
+
+def rows_of(buffer, numbers):
+    where = {int(number): row for row, number in enumerate(buffer.transitions.storage[:]["action"][:, 0])}
+    return [where[number] for number in numbers.tolist()]
+
+
+@pytest.mark.parametrize("way", ["state_dict", "dumps"])
+def test_what_is_kept_is_kept_by_a_restored_buffer_too(tmp_path, scratch, way):
+    camera = Camera()
+    buffer, other = (TaggedReplayBuffer(12, latent_dim=D, scratch_dir=scratch and scratch / name) for name in "ab")
+    buffer.add(camera.shoot(5), "success")
+    for _ in range(5):
+        buffer.add(camera.shoot(3), "online")
+    if way == "dumps":
+        buffer.dumps(tmp_path / "saved")
+        other.loads(tmp_path / "saved")
+    else:
+        other.load_state_dict(buffer.state_dict())
+    for _ in range(4):
+        episode = camera.shoot(3)
+        for each in (buffer, other):
+            each.add(episode, "online")
+    for each in (buffer, other):
+        each.encode(reading_encoder())
+        assert each.count(tags=["success"]) == 5
+    assert (buffer.transitions.storage[:] == other.transitions.storage[:]).all()
+    assert (buffer.frames.storage[:] == other.frames.storage[:]).all()
+
+
+def test_offline_data_that_cannot_all_be_kept_are_refused_whole():
+    camera = Camera()
+    buffer = TaggedReplayBuffer(10, latent_dim=D)
+    with pytest.raises(ValueError, match=r"have 12 transitions.*room for 10\. Raise capacity"):
+        buffer.add(torch.stack([camera.shoot(4) for _ in range(3)]), "success")
+    assert len(buffer) == 0
+    buffer.add(camera.shoot(8), "success")
+    with pytest.raises(ValueError, match=r"3 steps does not fit.*of which 8 and 9 hold offline data.*Raise capacity"):
+        buffer.add(camera.shoot(3), "online")
+    assert len(buffer) == 8
+    buffer.add(camera.shoot(2), "success")
+    with pytest.raises(ValueError, match="1 steps does not fit"):
+        buffer.add(camera.shoot(1), "online")
+
+
+def test_frames_of_offline_data_need_room_too():
+    camera = Camera()
+    buffer = TaggedReplayBuffer(10, latent_dim=D, frame_capacity=10)
+    with pytest.raises(ValueError, match=r"of which 6 and 8 hold offline data.*Raise frame_capacity"):
+        buffer.add([camera.shoot(3), camera.shoot(3), camera.shoot(3)], "success")
+    assert len(buffer) == len(buffer.frames) == 0
+
+
+def test_short_offline_episodes_leave_room_for_frames_of_online_ones():
+    camera = Camera()
+    buffer = TaggedReplayBuffer(100, latent_dim=D)
+    for _ in range(60):
+        buffer.add(camera.shoot(1), "success")  # two frames for each transition
+    for steps in (1, 2, 1, 40, 1, 39, 7, 40):
+        buffer.add(camera.shoot(steps), "online")
+        assert len(buffer.sample_frame_transitions(50)) == 50
+    buffer.encode(reading_encoder())
+    assert buffer.count(tags=["success"]) == 60
+    assert buffer.count(tags=["online"]) == 40
+    assert buffer.frame_capacity <= 200
 
 
 def test_many_rounds_of_the_ring_stay_consistent():
@@ -215,7 +300,7 @@ def test_overwritten_frames_are_refused_at_encoding_not_mixed_up():
     camera = Camera()
     buffer = TaggedReplayBuffer(10, latent_dim=D, frame_capacity=10)
     for _ in range(3):
-        buffer.add(camera.shoot(4), "success")
+        buffer.add(camera.shoot(4), "online")
     with pytest.raises(RuntimeError, match=r"older than number 5 were overwritten.*need frame 2.*frame_capacity"):
         buffer.encode(reading_encoder())
 
@@ -321,21 +406,21 @@ def test_pixel_transitions_join_both_images_to_their_action_after_the_ring_wrapp
     torch.manual_seed(0)
     camera = Camera()
     buffer = TaggedReplayBuffer(10, latent_dim=D, frame_capacity=13, scratch_dir=scratch)
-    for tag in ("success", "constraint", "online"):
+    for tag in ("online", "constraint", "success"):
         buffer.add(camera.shoot(4), tag)
     batch = buffer.sample_frame_transitions(400)  # no encoder yet
     number = batch["action"][:, 0].int()
     assert set(number.tolist()) == {2, 3, 5, 6, 7, 8, 10, 11, 12, 13}
     assert torch.equal(batch["pixels"][:, 0, 0, 0].int(), number)
     assert torch.equal(batch["next", "pixels"][:, 2, 5, 7].int(), number + 1)
-    assert set(buffer.sample_frame_transitions(200, tags=["online"])["action"][:, 0].tolist()) == {10, 11, 12, 13}
+    assert set(buffer.sample_frame_transitions(200, tags=["success"])["action"][:, 0].tolist()) == {10, 11, 12, 13}
 
 
 def test_stretches_follow_one_episode_over_the_rings_end(scratch):
     torch.manual_seed(0)
     camera = Camera()
     buffer = TaggedReplayBuffer(10, latent_dim=D, scratch_dir=scratch)
-    for tag in ("success", "constraint", "online"):
+    for tag in ("online", "constraint", "success"):
         buffer.add(camera.shoot(4), tag)
     # Left of frames 0-3, 5-8, 10-13: transitions 2, 3, 5-8, 10-13, of which the last lie at the ring's start.
     pixels = buffer.sample_frame_transitions(200, steps=3)
@@ -359,7 +444,7 @@ def test_pixel_transitions_whose_images_are_gone_are_refused():
     camera = Camera()
     buffer = TaggedReplayBuffer(10, latent_dim=D, frame_capacity=10)
     for _ in range(3):
-        buffer.add(camera.shoot(4), "success")
+        buffer.add(camera.shoot(4), "online")
     with pytest.raises(RuntimeError, match=r"older than number 5 were overwritten.*frame_capacity"):
         buffer.sample_frame_transitions(200)
 
@@ -390,7 +475,7 @@ def test_missing_keys_wrong_shapes_and_unknown_tags_are_refused():
 @pytest.mark.parametrize("sizes", [{"capacity": 3}, {"capacity": 20, "frame_capacity": 4}])
 def test_an_episode_longer_than_the_buffer_is_refused(sizes):
     with pytest.raises(ValueError, match="4 steps does not fit"):
-        TaggedReplayBuffer(latent_dim=D, **sizes).add(Camera().shoot(4), "success")
+        TaggedReplayBuffer(latent_dim=D, **sizes).add(Camera().shoot(4), "online")
 
 
 @pytest.mark.parametrize(

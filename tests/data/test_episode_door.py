@@ -404,12 +404,22 @@ def test_sets_that_differ_are_refused():
 # --- what a full buffer forgets ---------------------------------------------------------------------------------
 
 
-def test_offline_data_are_not_overwritten_without_a_word():
+def test_offline_data_that_come_late_are_not_overwritten_without_a_word():
     buffer = TaggedReplayBuffer(10, latent_dim=2, keys=KEYS)
-    buffer.add([episode(4), episode(4)], "success")
-    with pytest.warns(DataWarning, match=r"10 transitions is full.*offline data among them: 2 of success.*capacity"):
+    buffer.add(episode(4), "online")
+    buffer.add(episode(4), "success")
+    buffer.add(episode(4), "online")  # over online ones
+    with pytest.warns(DataWarning, match=r"10 transitions is full.*: 2 of success\. Add offline data first"):
         buffer.add(episode(4), "online")
     buffer.add(episode(4), "online")  # once is enough
+
+
+def test_offline_data_that_come_first_are_kept():
+    buffer = TaggedReplayBuffer(10, latent_dim=2, keys=KEYS)
+    buffer.add(episode(4), "success")
+    for _ in range(9):
+        buffer.add(episode(4), "online")
+    assert (len(buffer), buffer.count(tags=["success"])) == (10, 4)
 
 
 def test_online_data_are_overwritten_without_ado():
@@ -417,11 +427,6 @@ def test_online_data_are_overwritten_without_ado():
     for _ in range(9):
         buffer.add(episode(4), "online")
     assert len(buffer) == 10
-
-
-def test_a_set_larger_than_the_buffer_is_warned_of():
-    with pytest.warns(DataWarning, match="2 of those that are being added"):
-        TaggedReplayBuffer(10, latent_dim=2, keys=KEYS).add([episode(4)] * 3, "success")
 
 
 @pytest.mark.parametrize("wrong", [{"state": 1}, None, 3, "episode", torch.zeros(3), [torch.zeros(3)]])
