@@ -184,9 +184,21 @@ def writing(path: Path, *, shown: Path | None = None) -> Iterator[IO[bytes]]:
     except OSError as error:
         raise OSError(error.errno, f"{error.strerror or error}; it could not be written", name) from error
     except RuntimeError as error:
-        if shutil.disk_usage(path.parent).free < _NO_ROOM:
+        if is_full(error, path.parent):
             raise OSError(errno.ENOSPC, "No space left on device; it could not be written", name) from error
         raise
+
+
+def is_full(error: BaseException, folder: Path) -> bool:
+    """Whether a write to a folder failed for want of room; PyTorch's writer does not say it.
+
+    Args:
+        error: with which it failed.
+        folder: on the disk in question.
+    """
+    if isinstance(error, OSError):
+        return error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return isinstance(error, RuntimeError) and folder.is_dir() and shutil.disk_usage(folder).free < _NO_ROOM
 
 
 @contextmanager

@@ -1,8 +1,11 @@
-"""What all tests share: one seed, one thread, a short training loop, and how many inputs are made up for a property."""
+"""What all tests share: a seed, one thread, a training loop, a small disk, numbers of made-up inputs, the long form."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -17,6 +20,17 @@ settings.register_profile(
 )
 settings.register_profile("other", settings.get_profile("same"), derandomize=False)
 settings.load_profile("same")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--soak``: the long form of the tests of reliability."""
+    parser.addoption("--soak", action="store_true", help="the long form of tests/reliability; it takes hours")
+
+
+@pytest.fixture(scope="session")
+def soak(request: pytest.FixtureRequest) -> bool:
+    """Whether the long form of a test is asked for."""
+    return request.config.getoption("--soak")
 
 
 @pytest.fixture(autouse=True)
@@ -46,3 +60,22 @@ def minimise() -> Callable[..., tuple[float, float]]:
         return first, last
 
     return train
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
+    """A function that makes a file system of so many bytes, which is gone after the test."""
+    made: list[Path] = []
+
+    def make(size: int) -> Path:
+        folder = tmp_path / f"disk{len(made)}"
+        folder.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+        if shutil.which("mount") is None or subprocess.run(command, capture_output=True, check=False).returncode:
+            pytest.skip("no file system can be mounted here")
+        made.append(folder)
+        return folder
+
+    yield make
+    for folder in made:
+        subprocess.run(["umount", "-l", str(folder)], check=True)

@@ -198,7 +198,7 @@ class VisualConstraintEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         entropy = unused_seed() if seed is None else checked_seed(seed)
         self._generators = [_stream(entropy, index) for index in range(self.num_envs)]
-        self._streams = [generator.bit_generator.state for generator in self._generators]
+        self._streams = [dict(generator.bit_generator.state) for generator in self._generators]
         #: Of each environment without a seed, the process in which its stream was begun.
         self._unseeded = [process_id() if seed is None else None] * self.num_envs
 
@@ -218,6 +218,7 @@ class VisualConstraintEnv(EnvBase):
         for index, seed in enumerate(checked):
             if seed is not None:
                 self._generators[index], self._unseeded[index] = _stream(seed, 0), None
+                self._streams[index] = dict(self._generators[index].bit_generator.state)
 
     def _leave_other_processes_streams(self) -> None:
         """New streams where one without a seed was begun in another process, whose copies may all go on with it."""
@@ -246,7 +247,7 @@ class VisualConstraintEnv(EnvBase):
             )
         for generator, stream in zip(self._generators, state, strict=True):
             generator.bit_generator.state = stream
-        self._streams = list(state)
+        self._streams, self._unseeded = list(state), [None] * self.num_envs
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -254,7 +255,7 @@ class VisualConstraintEnv(EnvBase):
         self._leave_other_processes_streams()
         state, clock, frozen = self._state.clone(), self._clock.clone(), self._frozen.clone()
         for index in rows.tolist():
-            self._streams[index] = self._generators[index].bit_generator.state
+            self._streams[index] = dict(self._generators[index].bit_generator.state)
             state[index] = self._initial_state(index, self._generators[index]).to(state)
         clock[rows] = 0
         frozen[rows] = self._violates(state)[rows]

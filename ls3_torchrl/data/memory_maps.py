@@ -1,13 +1,17 @@
-"""Folders of tensordict's memory maps, in which episodes were kept before: read without trusting them."""
+"""Tensordict's memory maps: read without trusting them, and given the disk's space before they are written."""
 
 from __future__ import annotations
 
+import errno
 import math
+import os
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from tensordict import MemoryMappedTensor, TensorDictBase
 from torch import Tensor
 
 from ls3_torchrl.files import load_json
@@ -59,3 +63,41 @@ def _read_map(path: Path, entry: dict[str, Any], about: Path) -> Tensor:
         return torch.empty(shape, dtype=dtype)
     bytes_ = torch.from_numpy(np.memmap(path, dtype=np.uint8, mode="c", shape=(wanted,)))
     return bytes_.view(dtype).reshape(shape)
+
+
+def require_free_space(folder: Path, size: int) -> None:
+    """Raise ``OSError`` where a folder's disk has less than ``size`` bytes left."""
+    free = shutil.disk_usage(folder).free
+    if free < size:
+        raise OSError(errno.ENOSPC, f"No space left on device: {size} bytes are needed, {free} are free", str(folder))
+
+
+def reserve_rows(maps: TensorDictBase, start: int, count: int) -> None:
+    """Take the disk's space for rows of memory maps that are about to be written.
+
+    The files of new maps are holes; a write through memory that finds no space for one ends the process with SIGBUS.
+
+    Args:
+        maps: rows along the first dimension.
+        start: number of the first row.
+        count: how many.
+
+    Raises:
+        OSError: naming the file, when there is no space.
+    """
+    if not hasattr(os, "posix_fallocate"):  # the system has no such call
+        return
+    for leaf in maps.values(True, True):
+        if not isinstance(leaf, MemoryMappedTensor) or leaf.filename is None:
+            continue
+        row = leaf[0].numel() * leaf.itemsize
+        if not row * count:
+            continue
+        handle = os.open(leaf.filename, os.O_RDWR)
+        try:
+            os.posix_fallocate(handle, start * row, count * row)
+        except OSError as error:
+            said = f"{error.strerror}: no space for {count} more rows"
+            raise OSError(error.errno, said, str(leaf.filename)) from error
+        finally:
+            os.close(handle)

@@ -16,11 +16,13 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from ls3_torchrl.data.arrays import read_array, require_checksum, with_checksum, write_array
 from ls3_torchrl.data.keys import as_tuple
-from ls3_torchrl.data.memory_maps import read_memory_maps
+from ls3_torchrl.data.memory_maps import read_memory_maps, require_free_space, reserve_rows
 from ls3_torchrl.files import load_json, new_folder, save_json_atomically
 
 #: Rows that are copied at a time where all of them might not fit into memory.
 _CHUNK = 1024
+#: What the first row may take in files of its own, beyond its size.
+_FIRST_BYTES = 2**20
 _META = "meta.json"
 #: Marks a folder that a store made for its own use.
 _SCRATCH = "scratch.txt"
@@ -105,6 +107,12 @@ class RowStore(TensorDictReplayBuffer):
             raise RuntimeError(f"All {self.capacity} rows are kept, and none may be overwritten. Make a larger store.")
         while len(rows):
             room = self.capacity - self.cursor
+            if self._folder is not None:
+                if not self.storage.initialized:
+                    require_free_space(self._folder, rows[:room].bytes() + _FIRST_BYTES)
+                    room = 1  # the files are made by the first row, and have their space from the second on
+                else:
+                    reserve_rows(self.storage[:], self.cursor, min(len(rows), room))
             # Else a store that is first written under inference_mode() could never be written outside of it.
             with torch.inference_mode(False), torch.no_grad():
                 written.append(super().extend(rows[:room], update_priority=update_priority))

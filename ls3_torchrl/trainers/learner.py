@@ -73,12 +73,15 @@ class DivergenceError(FloatingPointError):
 
 
 def descend(optimizer: torch.optim.Optimizer, parameters: Iterable[Parameter], value: Tensor) -> bool:
-    """One gradient step down ``value``; none, and ``False``, when it or its gradient is not finite."""
+    """One gradient step down ``value``; none, and ``False``, when it, its gradient or the square of that is not finite.
+
+    Adam's average of squares would stay infinite for ever, and what it belongs to would never move again.
+    """
     optimizer.zero_grad()
     value.backward()
-    # NaN and infinity outlast a sum, which is cheaper than a look at every entry.
-    sums = [parameter.grad.sum() for parameter in parameters if parameter.grad is not None]
-    if not torch.isfinite(torch.stack([value.detach(), *sums]).sum()):
+    # NaN and infinity outlast norms, which are cheaper than a look at every entry.
+    norms = [torch.linalg.vector_norm(parameter.grad) for parameter in parameters if parameter.grad is not None]
+    if not torch.isfinite(torch.stack([value.detach(), *norms]).sum()):
         return False
     optimizer.step()
     return True

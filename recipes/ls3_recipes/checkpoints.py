@@ -14,11 +14,10 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation, StateDictCheckpoi
 
 from ls3_recipes.console import console
 from ls3_recipes.interrupts import Interrupts
+from ls3_torchrl.files import is_full
 
 #: Checkpoints kept: the newest, and the one before for when the newest is damaged.
 KEPT = 2
-#: Free bytes below which a write that failed is taken for one that found no room.
-_NO_ROOM = 16 * 2**20
 
 
 class Stateful(Protocol):
@@ -70,11 +69,10 @@ class RunCheckpoints:
             _sync(path)
             _sync(self.folder)
         except (OSError, RuntimeError) as error:
-            if _is_full(error, self.folder):
+            if is_full(error, self.folder):
                 raise OSError(
                     errno.ENOSPC,
-                    "The disk is full: the run's state could not be saved. The one saved before is whole; make room, "
-                    "then continue the run",
+                    "No space left on device: the run's state could not be saved, and the one saved before is whole",
                     str(self.folder),
                 ) from error
             raise
@@ -171,10 +169,3 @@ def _sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _is_full(error: BaseException, folder: Path) -> bool:
-    """Whether a write failed for want of room; PyTorch's writer does not say."""
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return True
-    return isinstance(error, RuntimeError) and folder.is_dir() and shutil.disk_usage(folder).free < _NO_ROOM

@@ -25,6 +25,8 @@ from ls3_recipes.renamed import RENAMED, on_command_line, rename_overrides, rena
 from ls3_recipes.run_files import read_yaml
 from ls3_recipes.run_settings import RunSettings
 from ls3_recipes.typed import did_you_mean
+from ls3_torchrl.files import is_full
+from ls3_torchrl.trainers import DivergenceError
 
 S = TypeVar("S")
 _HEADING = "All settings, with the values that these arguments give"
@@ -242,16 +244,23 @@ def _of_hydra(options: Sequence[str]) -> bool:
 
 @contextmanager
 def errors_in_one_line(who: str, output: Path | None = None) -> Iterator[None]:
-    """End the process with one line for what is wrong with settings, data and files, as long as no output is made."""
+    """End the process with one line for what is wrong with settings, data and files, as long as no output is made.
+
+    After that only for what a user can mend: a full disk, and training that diverges.
+    """
     before = output is not None and os.path.lexists(output)
     try:
         yield
-    except (ValueError, TypeError, KeyError, OSError, ImportError) as error:
-        begun = output is not None and os.path.lexists(output) and not before
-        if begun or os.environ.get("HYDRA_FULL_ERROR") == "1":  # Hydra's own wish for the whole trace
+    except (ValueError, TypeError, KeyError, OSError, ImportError, DivergenceError) as error:
+        notes = getattr(error, "__notes__", [])  # of a run that has begun
+        begun = bool(notes) or (output is not None and os.path.lexists(output) and not before)
+        full = is_full(error, Path())
+        if begun and not full and not isinstance(error, DivergenceError):
+            raise
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":  # Hydra's own wish for the whole trace
             raise
         said = error.args[0] if isinstance(error, KeyError) and error.args else error
-        raise SystemExit(f"{who}: {' '.join(str(said).split())}") from None
+        raise SystemExit(f"{who}: {' '.join(' '.join([str(said), *notes]).split())}") from None
 
 
 def help_of(

@@ -23,13 +23,13 @@ def command_line(who: str) -> Iterator[None]:
     """Inside, what is said reads well on a terminal.
 
     What is said of data comes as a line instead of a Python warning; TorchRL tells nothing but warnings; characters
-    that the terminal lacks become question marks; and Ctrl-C ends with one line.
+    that the terminal lacks become question marks; and Ctrl-C and SIGTERM end with one line.
 
     Args:
         who: what lines begin with.
 
     Raises:
-        SystemExit: with code 130, the shells' own, for Ctrl-C.
+        SystemExit: with the shells' own code for Ctrl-C and SIGTERM, 130 and 143.
     """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure") and (stream.encoding or "").lower().replace("-", "") != "utf8":
@@ -42,9 +42,9 @@ def command_line(who: str) -> Iterator[None]:
             warnings.simplefilter("always", DataWarning)
             warnings.showwarning = _show(who, warnings.showwarning)
             yield
-    except KeyboardInterrupt:
-        print(f"{who}: stopped by Ctrl-C.", file=sys.stderr)
-        raise SystemExit(130) from None
+    except KeyboardInterrupt as stop:
+        print(f"{who}: {str(stop) or 'stopped by Ctrl-C'}.", file=sys.stderr)
+        raise SystemExit(getattr(stop, "exit_code", 130)) from None
     finally:
         logger.setLevel(level)
 

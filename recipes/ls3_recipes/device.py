@@ -34,12 +34,17 @@ def choose_device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def hardware(device: torch.device) -> dict[str, str | int]:
-    """What the run ran on."""
-    name = platform.processor() or platform.machine()
+def processor() -> str:
+    """The model of the processor."""
     if Path("/proc/cpuinfo").is_file():
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
         models = [line for line in lines if line.startswith("model name")]
-        name = models[0].split(":", 1)[1].strip() if models else name
+        if models:
+            return models[0].split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def hardware(device: torch.device) -> dict[str, str | int]:
+    """What the run ran on."""
     gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else "none"
-    return {"cpu": name, "cores": available_cores(), "threads": torch.get_num_threads(), "gpu": gpu}
+    return {"cpu": processor(), "cores": available_cores(), "threads": torch.get_num_threads(), "gpu": gpu}

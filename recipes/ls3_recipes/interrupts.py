@@ -23,7 +23,7 @@ class Interrupted(KeyboardInterrupt):
     """
 
     def __init__(self, number: int) -> None:
-        super().__init__(f"interrupted by {signal.Signals(number).name}")
+        super().__init__("stopped by " + ("Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name))
         self.number = number
 
     @property
@@ -43,7 +43,7 @@ class Interrupts:
         ...     interrupts.pending
         Traceback (most recent call last):
         ...
-        ls3_recipes.interrupts.Interrupted: interrupted by SIGTERM
+        ls3_recipes.interrupts.Interrupted: stopped by SIGTERM
     """
 
     def __init__(self) -> None:

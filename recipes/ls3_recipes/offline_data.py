@@ -9,9 +9,10 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import TensorSpec
 
+from ls3_recipes.console import console
 from ls3_recipes.rollout import collect_demonstrations
 from ls3_recipes.run_settings import TaskSettings
-from ls3_torchrl.data import Tag, check_datasets, load_episodes, save_episodes
+from ls3_torchrl.data import Tag, TaggedReplayBuffer, check_datasets, load_episodes, save_episodes
 
 Offline = dict[Tag, TensorDictBase]
 
@@ -56,3 +57,18 @@ def collected_data(folder: Path, task: TaskSettings, seed: int, run_seed: int) -
             collected = collect_demonstrations(task, seed)
         save_episodes(collected, folder, task=task.name, seed=run_seed)
     return load_episodes(folder)  # from the disk: there may be more than memory
+
+
+def tell_of_eviction(buffer: TaggedReplayBuffer, online: int) -> None:
+    """Say how much of the online episodes a buffer will forget.
+
+    Args:
+        buffer: that holds the offline data.
+        online: transitions to come.
+    """
+    room = buffer.capacity - len(buffer)
+    if online > room:
+        console.print(
+            f"The replay buffer holds all {len(buffer)} offline transitions and the newest {room} of {online} online "
+            f"ones: buffer.capacity={buffer.capacity}."
+        )

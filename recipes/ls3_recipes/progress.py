@@ -93,8 +93,8 @@ class HeldRandomState:
         self._held: Mapping[str, Any] | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        """The streams now."""
-        return self._streams.state_dict()
+        """The state that is held, or else the streams now."""
+        return dict(self._streams.state_dict() if self._held is None else self._held)
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Hold a state until :meth:`release`."""

@@ -14,16 +14,15 @@ from ls3_recipes.console import console, print_summary
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.figures import Figures, best_update, episode_figures, means_of, summarise
 from ls3_recipes.interrupts import Interrupts
-from ls3_recipes.offline_data import Offline, collected_data, given_data
+from ls3_recipes.offline_data import Offline, collected_data, given_data, tell_of_eviction
 from ls3_recipes.plots.run import pictures_of_run
 from ls3_recipes.plots.style import draw
 from ls3_recipes.progress import HeldRandomState, Progress, Worlds
-from ls3_recipes.resume import open_folder, require_place
+from ls3_recipes.resume import begun_with, open_folder
 from ls3_recipes.rollout import make_env, run_episodes, tick, whole_episodes
 from ls3_recipes.run_settings import RunSettings, decided
 from ls3_recipes.together import require_room, require_tools
 from ls3_torchrl.data import Tag, load_episodes, save_episodes
-from ls3_torchrl.files import save_atomically, save_json_atomically
 from ls3_torchrl.trainers import DivergenceError
 from ls3_torchrl.trainers.learner import log_scalars
 from ls3_torchrl.trainers.progress import progress_bar
@@ -59,10 +58,14 @@ def run_experiment(settings: RunSettings) -> dict:
             experiment.evaluate()
             return experiment.finish()
         except DivergenceError as error:
-            experiment.keep(error)
+            kept = experiment.folder.keep_divergence(error, experiment.algorithm.state_dict())
+            error.add_note(f"The batch and the state of that moment are in {kept}.")
+            raise
+        except Exception as error:
+            error.add_note(f"To go on when the cause is removed: ls3 train resume={experiment.folder.path}")
             raise
         except KeyboardInterrupt:
-            console.print(f"Stopped. To go on: ls3 train resume={experiment.folder.path}")
+            console.print(f"To go on: ls3 train resume={experiment.folder.path}")
             raise
         finally:
             experiment.folder.close()
@@ -86,11 +89,11 @@ class Experiment:
 
     def __init__(self, settings: RunSettings, interrupts: Interrupts) -> None:
         self.device = choose_device(settings.device)
-        self.settings, self.seed = decided(settings, self.device), seeds(settings.seed)
-        require_place(self.settings)
+        self.settings, self.seed = decided(settings, self.device, begun_with(settings)), seeds(settings.seed)
+        settings = self.settings
         self.interrupts = interrupts
-        if settings.threads:
-            torch.set_num_threads(settings.threads)
+        assert settings.threads is not None
+        torch.set_num_threads(settings.threads)
         torch.manual_seed(self.seed["learning"])
         self.env = make_env(settings.task, settings.online.episodes_per_update, self.seed["online"], self.device)
         self.horizon: int = self.env.base_env.horizon
@@ -128,6 +131,7 @@ class Experiment:
                 self.offline = collected_data(path, settings.task, self.seed["demonstrations"], settings.seed)
             for tag, episodes in self.algorithm.offline_data(self.offline).items():
                 self.buffer.add(episodes, tag)
+        tell_of_eviction(self.buffer, settings.online.updates * settings.online.episodes_per_update * self.horizon)
         self.algorithm.begin(self.buffer, self.folder.logger, self.horizon, self.state.after_step)
 
     def resume(self) -> None:
@@ -160,7 +164,12 @@ class Experiment:
         updates, frames = self.settings.online.updates, self.settings.online.episodes_per_update * self.horizon
         left = updates - self.progress.collected
         bar = progress_bar(self.horizon, "Planning")
-        ticking = self.algorithm.policy.register_forward_hook(lambda *_: tick(bar))
+
+        def after_step(*_: object) -> None:
+            tick(bar)
+            self.interrupts.check()  # a signal that came while C code called Python was swallowed there
+
+        ticking = self.algorithm.policy.register_forward_hook(after_step)
         if self.progress.collected == 0:
             self.random.release()  # that state was saved before there was a collector
         rounds = iter(self._collector(frames, left)) if left else iter(())
@@ -177,6 +186,7 @@ class Experiment:
                 with self.progress.timed("updates"):
                     self.algorithm.update()
                 self.algorithm.save(self.folder.agent(update))
+                self.folder.thin_out_agents(updates, update, best_update(self.online))
                 self.progress.updated = update
                 self.state.save()
         ticking.remove()
@@ -219,17 +229,6 @@ class Experiment:
         self.online.append(figures)
         self.tracks.append(episodes["next", "state"].cpu())
         return figures
-
-    def keep(self, error: DivergenceError) -> None:
-        """Keep what training diverged on, for a look; the state that was saved last stays."""
-        path = self.folder.path / "diverged"
-        save_json_atomically({"error": str(error), "phase": error.phase, "step": error.step}, path / "error.json")
-        content = {
-            "batch": None if error.batch is None else error.batch.to_dict(),
-            "state": self.algorithm.state_dict(),
-        }
-        save_atomically(content, path / "state.pt")
-        console.print(f"The batch and the state of that moment are in [bold]{path}[/bold].")
 
     def select(self) -> None:
         """Keep the agent: the last one, or the one whose episodes went best."""

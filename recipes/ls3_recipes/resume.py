@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,14 @@ from ls3_recipes.versions import FORMAT, VERSION, description
 RUNS = Path("runs")
 #: Settings that say where a run is, and not what it does.
 _PLACE = "output"
+#: What stands for a choice that was made when the run began.
+_OPEN = {
+    "device": "auto",
+    "threads": None,
+    "vae.autocast": "auto",
+    "optim.autocast": "auto",
+    "planner.precision": "auto",
+}
 
 
 def open_folder(settings: RunSettings) -> RunFolder:
@@ -26,6 +35,9 @@ def open_folder(settings: RunSettings) -> RunFolder:
 
     Without ``output``, a run below ``runs/`` with the same settings, the same code and the same packages: it ends in
     the same bits as one that starts afresh, only sooner.
+
+    Args:
+        settings: of the run, in which nothing is left open.
 
     Raises:
         FileExistsError: for an ``output`` that is no run, a finished one, one of other settings, or one that another
@@ -38,32 +50,36 @@ def open_folder(settings: RunSettings) -> RunFolder:
             return RunFolder.make(path, wanted)
         require_same_run(path, wanted)
         return reopen(path)
-    name = name_of(settings)
-    for path in sorted(RUNS.glob(f"{name}-*"), reverse=True):
-        folder = _continued(path, wanted)
-        if folder is not None:
-            return folder
-    return _make_new(f"{name}-{datetime.now():%Y%m%d-%H%M%S}", wanted)
+    for path in _cut_off(settings):
+        with suppress(FileExistsError):  # another process is at it
+            return reopen(path)
+    return _make_new(f"{name_of(settings)}-{datetime.now():%Y%m%d-%H%M%S}", wanted)
+
+
+def begun_with(settings: RunSettings) -> dict[str, Any]:
+    """The settings with which the run began that :func:`open_folder` will continue; none of a new one.
+
+    Args:
+        settings: of the run; what is left open in them was decided when it began.
+
+    Raises:
+        FileExistsError: for an ``output`` that cannot be continued.
+        ValueError: for one that cannot be made.
+    """
+    if settings.output is None:
+        require_writable(RUNS / "new", "output")
+        there = next(_cut_off(settings), None)
+        return {} if there is None else read_yaml(there / "config.yaml")
+    if os.path.lexists(settings.output):
+        return require_same_run(Path(settings.output), as_dict(settings))
+    require_new(settings.output)
+    return {}
 
 
 def name_of(settings: RunSettings) -> str:
     """What a run without ``output`` is called, before the time."""
     what = [settings.task.name, settings.preset, f"seed{settings.seed}"]
     return "-".join(what if settings.algorithm == "ls3" else [settings.algorithm, *what])
-
-
-def require_place(settings: RunSettings) -> None:
-    """Refuse, before any work, a place in which :func:`open_folder` could not begin or go on.
-
-    Raises:
-        FileExistsError, ValueError: as there.
-    """
-    if settings.output is None:
-        require_writable(RUNS / "new", "output")
-    elif os.path.lexists(settings.output):
-        require_same_run(Path(settings.output), as_dict(settings))
-    else:
-        require_new(settings.output)
 
 
 def _make_new(name: str, wanted: Mapping[str, Any]) -> RunFolder:
@@ -77,15 +93,13 @@ def _make_new(name: str, wanted: Mapping[str, Any]) -> RunFolder:
             number += 1
 
 
-def _continued(path: Path, wanted: Mapping[str, Any]) -> RunFolder | None:
-    """The folder of an unfinished run that would do the same, unless another process is at it."""
-    try:
-        require_same_run(path, wanted)
-        if read_json(path / "versions.json") != description():
-            return None
-        return reopen(path)
-    except (OSError, ValueError):
-        return None
+def _cut_off(settings: RunSettings) -> Iterator[Path]:
+    """Folders below ``runs/`` of unfinished runs that would do the same, the newest first."""
+    for path in sorted(RUNS.glob(f"{name_of(settings)}-*"), reverse=True):
+        with suppress(OSError, ValueError):
+            require_same_run(path, as_dict(settings))
+            if read_json(path / "versions.json") == description():
+                yield path
 
 
 def reopen(path: Path) -> RunFolder:
@@ -95,6 +109,7 @@ def reopen(path: Path) -> RunFolder:
         FileExistsError: while another process writes to it.
     """
     folder = RunFolder(path)
+    folder.tidy()
     console.print(f"Continuing the run in [bold]{path}[/bold], which was cut off.")
     there = read_json(path / "versions.json")
     changed = [name for name, value in description().items() if there.get(name) != value]
@@ -106,8 +121,8 @@ def reopen(path: Path) -> RunFolder:
     return folder
 
 
-def require_same_run(path: Path, wanted: Mapping[str, Any]) -> None:
-    """Raise ``FileExistsError`` for a folder that holds no unfinished run of these settings."""
+def require_same_run(path: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with which a run began; ``FileExistsError`` for a folder that holds no unfinished run of these."""
     if not (path / "config.yaml").is_file():
         require_new(path)
     there = read_yaml(path / "config.yaml")
@@ -118,6 +133,7 @@ def require_same_run(path: Path, wanted: Mapping[str, Any]) -> None:
             "Choose another output=DIR, or give the settings of that run to continue it."
         )
     require_unfinished(path)
+    return there
 
 
 def require_unfinished(path: Path) -> None:
@@ -135,10 +151,10 @@ def require_unfinished(path: Path) -> None:
 
 
 def _differences(there: Mapping[str, Any], wanted: Mapping[str, Any], where: str = "") -> Iterator[str]:
-    """Settings that differ; ``"auto"`` was decided when the run began."""
+    """Settings that differ, but for choices that were made when the run began."""
     for key in sorted({*there, *wanted}):
         one, other = there.get(key), wanted.get(key)
         if isinstance(one, Mapping) and isinstance(other, Mapping):
             yield from _differences(one, other, f"{where}{key}.")
-        elif one != other and other != "auto" and where + key != _PLACE:
+        elif one != other and where + key != _PLACE and (where + key, other) not in _OPEN.items():
             yield f"{where}{key}={one!r} there, {other!r} here"

@@ -6,7 +6,6 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 from omegaconf import OmegaConf
 
@@ -14,12 +13,17 @@ from ls3_recipes.checkpoints import RunCheckpoints
 from ls3_recipes.run_files import require_new
 from ls3_recipes.run_logger import RunLogger
 from ls3_recipes.versions import description
-from ls3_torchrl.files import save_json_atomically, save_text_atomically
+from ls3_torchrl.files import PARTIAL, new_folder, save_atomically, save_json_atomically, save_text_atomically
+from ls3_torchrl.trainers import DivergenceError
 
 try:
     import fcntl
 except ImportError:  # on Windows
     fcntl = None  # type: ignore[assignment]
+
+
+#: Updates whose agents are kept of a long run.
+AGENTS = 100
 
 
 class RunFolder:
@@ -45,18 +49,29 @@ class RunFolder:
         Raises:
             FileExistsError: when the folder exists.
         """
-        path = require_new(path)
-        new = path.with_name(f".{path.name}.{uuid4().hex}")  # in one go: a folder with these files or none
-        new.mkdir(parents=True)
-        save_text_atomically(OmegaConf.to_yaml(OmegaConf.create(dict(settings))), new / "config.yaml")
-        save_json_atomically(description(), new / "versions.json")
-        try:
-            new.rename(path)
-        except OSError:  # another run has made it meanwhile
-            shutil.rmtree(new)
-            require_new(path)
-            raise
+        with new_folder(require_new(path)) as new:  # with both files or not at all
+            save_text_atomically(OmegaConf.to_yaml(OmegaConf.create(dict(settings))), new / "config.yaml")
+            save_json_atomically(description(), new / "versions.json")
         return cls(path)
+
+    def tidy(self) -> None:
+        """Remove what a process that was killed had begun to write."""
+        for path in sorted(self.path.rglob(f".*{PARTIAL}")):
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        self.states.tidy()
+
+    def thin_out_agents(self, updates: int, *others: int) -> None:
+        """Keep the agents of at most :data:`AGENTS` updates, evenly spaced, and others by number.
+
+        Args:
+            updates: of the whole run.
+            others: updates whose agents stay.
+        """
+        interval = -(-updates // AGENTS)
+        for path in (self.path / "checkpoints").glob("agent_*.pt"):
+            update = int(path.stem.removeprefix("agent_"))
+            if update % interval and update not in others:
+                path.unlink()
 
     @property
     def minutes(self) -> float:
@@ -74,6 +89,14 @@ class RunFolder:
     def write_json(self, name: str, content: dict) -> Path:
         """Write a JSON file in one go: a half-written file never takes its place."""
         return save_json_atomically(content, self.path / name)
+
+    def keep_divergence(self, error: DivergenceError, state: dict[str, Any]) -> Path:
+        """Keep what training diverged on, for a look, and return where; the state that was saved last stays."""
+        path = self.path / "diverged"
+        save_json_atomically({"error": str(error), "phase": error.phase, "step": error.step}, path / "error.json")
+        batch = None if error.batch is None else error.batch.to_dict()
+        save_atomically({"batch": batch, "state": state}, path / "state.pt")
+        return path
 
     def close(self) -> None:
         """Flush and close what is open, and leave the folder to others."""

@@ -34,6 +34,8 @@ class RunLogger(Logger):
         [('Safe set', '100', 'loss_safe_set', '0.25')]
     """
 
+    experiment: SummaryWriter
+
     def __init__(self, folder: str | Path) -> None:
         self._start, self._earlier = time.perf_counter(), 0.0
         self._path = Path(folder) / "metrics.csv"
@@ -91,9 +93,10 @@ class RunLogger(Logger):
         self._start = time.perf_counter()
         self.experiment.close()
         shutil.rmtree(Path(self.log_dir) / self.exp_name, ignore_errors=True)
-        self.experiment = self._create_experiment()
+        board = self._create_experiment()
         for row in read_metrics(self.log_dir):
-            self.experiment.add_scalar(f"{row['phase']}/{row['name']}", float(row["value"]), int(row["step"]))
+            board.add_scalar(f"{row['phase']}/{row['name']}", float(row["value"]), int(row["step"]))
+        self.experiment = board
 
     def restart(self) -> None:
         """Remove all that was logged."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -146,11 +147,12 @@ class RunSettings:
         preset: how much effort, as the files in ``conf/preset`` say.
         seed: of everything.
         output: the run's folder; a run that was cut off there goes on. ``None`` for one below ``runs/``.
-        checkpoint_minutes: while training, the run's state is saved this often; also after every round of episodes.
+        checkpoint_minutes: above 0; while training, the run's state is saved this often; also after every round of
+            episodes and every update.
         data: a folder of episodes made by ``ls3 collect``; ``None`` collects them anew.
         scratch_dir: memory-map the replay buffer in this folder instead of holding it in memory.
         device: ``"auto"``, ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
-        threads: intra-op threads, at least 1; ``None`` leaves PyTorch's choice.
+        threads: intra-op threads, at least 1; ``None`` for PyTorch's choice, which is kept for the whole run.
         pictures: leave pictures in the run's folder.
         task: what is learnt.
         agent: sizes of the networks. To a baseline that reads latents, all of them matter: it makes the whole agent, so
@@ -185,6 +187,7 @@ class RunSettings:
         for name in ("output", "data", "scratch_dir"):
             require_path(getattr(self, name), name)
         require_threads(self.threads)
+        require_positive(self.checkpoint_minutes, "checkpoint_minutes")
 
     def require_horizon(self, steps: int) -> None:
         """Raise ``ValueError`` for a setting that does not fit episodes of so many steps."""
@@ -198,19 +201,26 @@ class RunSettings:
         return {}
 
 
-def decided(settings: S, device: torch.device) -> S:
-    """Settings in which nothing is ``"auto"``: what a measurement decides is decided once for the whole run.
+def decided(settings: S, device: torch.device, begun: Mapping[str, Any]) -> S:
+    """Settings in which nothing is left open: what a measurement or the machine decides is decided once for a run.
 
     Args:
         settings: of a run.
         device: that it computes on.
+        begun: the settings with which it began, if it is continued.
     """
-    choices = {"vae": "autocast", "optim": "autocast", "planner": "precision"}
     changes: dict[str, Any] = {"device": str(device)}
+    if settings.threads is None:
+        changes["threads"] = begun.get("threads") or torch.get_num_threads()
+    choices = {"vae": "autocast", "optim": "autocast", "planner": "precision"}
     for name, choice in choices.items():
         section = getattr(settings, name, None)
         if getattr(section, choice, None) == "auto":
-            fastest = fastest_precision(device.type)
-            value = fastest if choice == "precision" else fastest == "bf16"
+            value = begun[name][choice] if begun else _fastest(choice, device)
             changes[name] = dataclasses.replace(section, **{choice: value})  # type: ignore[type-var]
     return dataclasses.replace(settings, **changes)
+
+
+def _fastest(choice: str, device: torch.device) -> str | bool:
+    precision = fastest_precision(device.type)
+    return precision if choice == "precision" else precision == "bf16"

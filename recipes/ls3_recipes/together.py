@@ -62,7 +62,7 @@ def _require_vae(settings: RunSettings, channels: int) -> None:
 
 
 def require_room(settings: RunSettings, offline: Mapping[Tag, TensorDictBase], horizon: int) -> None:
-    """Refuse a replay buffer that would forget demonstrations before anything is learnt from them.
+    """Refuse a replay buffer that has no room for the demonstrations and what is learnt from first.
 
     Args:
         settings: of a run.
@@ -76,16 +76,13 @@ def require_room(settings: RunSettings, offline: Mapping[Tag, TensorDictBase], h
     steps = (
         sum(len(row) for episodes in offline.values() for row in episodes.unbind(0)) if offline else _steps(settings)
     )
-    needed = {
-        "the offline data": 0 if buffer["success_tail"] else steps,  # cut, they take fewer
-        "the episodes of one update": online.episodes_per_update * horizon if online.updates else 0,
-    }
-    for what, transitions in needed.items():
-        if transitions > buffer["capacity"]:
-            raise ValueError(
-                f"buffer.capacity must be at least {transitions}, the transitions of {what}; got "
-                f"{buffer['capacity']}. Raise it, or have fewer or shorter episodes."
-            )
+    offline_steps = 0 if buffer["success_tail"] else steps  # cut, they take fewer
+    transitions = offline_steps + (online.episodes_per_update * horizon if online.updates else 0)
+    if transitions > buffer["capacity"]:
+        raise ValueError(
+            f"buffer.capacity must be at least {transitions}, the transitions of the offline data and of the episodes "
+            f"of one update; got {buffer['capacity']}. Raise it, or have fewer or shorter episodes."
+        )
 
 
 def _steps(settings: RunSettings) -> int:

@@ -1,4 +1,4 @@
-"""What decides what a run does, beside its settings: code and packages."""
+"""What decides what a run does, beside its settings: code, packages and processor."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 import ls3_envs
 import ls3_recipes
 import ls3_torchrl
+from ls3_recipes.device import processor
 
 #: Of a run's folder.
 FORMAT = "ls3_recipes.run"
@@ -32,7 +33,7 @@ def code() -> str:
 
 def description() -> dict[str, Any]:
     """What ``versions.json`` of a run that starts now says."""
-    return {"format": FORMAT, "version": VERSION, "code": code(), **versions()}
+    return {"format": FORMAT, "version": VERSION, "code": code(), "processor": processor(), **versions()}
 
 
 def versions() -> dict[str, str]:

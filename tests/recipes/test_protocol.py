@@ -11,7 +11,7 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
-from ls3_recipes import protocol
+from ls3_recipes import offline_data, protocol
 from ls3_recipes.algorithms import ls3
 from ls3_recipes.configuration import settings_of_run, train_settings
 from ls3_recipes.options import as_dict
@@ -34,7 +34,7 @@ def no_work(monkeypatch):
     def work(*args, **kwargs):
         pytest.fail("the run began to work")
 
-    monkeypatch.setattr(protocol, "collect_demonstrations", work)
+    monkeypatch.setattr(offline_data, "collect_demonstrations", work)
     monkeypatch.setattr(ls3, "LS3Trainer", work)
     monkeypatch.setattr(ls3, "VAETrainer", work)
 

@@ -86,6 +86,7 @@ NUMBERS = {
             "optim.lr",
             "policy.alpha",
             "policy.initial_std",
+            "checkpoint_minutes",
             "policy.lr",
             "policy.temperature",
             "vae.lr",
@@ -143,7 +144,7 @@ SIZES = {"agent.dynamics_hidden", "agent.value_hidden", "agent.classifier_hidden
 PAIRS = {"vae.crop_scale", "vae.warmup"}
 TEXTS = {"algorithm", "preset", "device", "output"}
 PATHS = {"data", "scratch_dir", "vae.checkpoint", "output"}
-OR_NULL = {"data", "scratch_dir", "vae.checkpoint", "vae.crop_scale", "vae.warmup", "loss.failure_value"}
+OR_NULL = {"data", "output", "scratch_dir", "vae.checkpoint", "vae.crop_scale", "vae.warmup", "loss.failure_value"}
 
 
 def is_whole(value, low):

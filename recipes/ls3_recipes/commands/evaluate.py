@@ -99,6 +99,19 @@ def trained_settings(settings: EvaluateSettings) -> RunSettings:
         return replace(trained, planner=replace(trained.planner, **changes))
 
 
+def _require_agent(file: Path, run: Path) -> None:
+    """Raise ``FileNotFoundError`` for an agent that is not there, with those that are."""
+    if file.is_file():
+        return
+    there = [str(path.relative_to(run)) for path in sorted(run.glob("checkpoints/agent_*.pt"))]
+    unfinished = not (run / "summary.json").is_file()
+    raise FileNotFoundError(
+        f"{file} is missing."
+        + (f" The run is not finished: ls3 train resume={run} goes on with it." if unfinished else "")
+        + (f" Its newest agent is agent={there[-1]}, of {len(there)}." if there else " It has left no agent.")
+    )
+
+
 def evaluate(settings: EvaluateSettings) -> dict:
     """Run episodes of a trained policy.
 
@@ -118,6 +131,7 @@ def evaluate(settings: EvaluateSettings) -> dict:
     algorithm = ALGORITHMS[trained.algorithm](trained, env, device)
     algorithm.prepare(env)
     file = Path(settings.run) / settings.agent
+    _require_agent(file, Path(settings.run))
     algorithm.restore(file)
     folder = RunFolder.make(settings.output, as_dict(settings) | {"planner": as_dict(trained).get("planner", {})})
     episodes = run_episodes(env, algorithm.policy, what="Evaluation")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 
 import ls3_envs  # noqa: F401  (before TorchRL, which imports MuJoCo: whatever MUJOCO_GL says)
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.configuration import errors_in_one_line, run_command, settings_class_of, settings_of_run
-from ls3_recipes.interrupts import Interrupted
+from ls3_recipes.console import command_line
 from ls3_recipes.overrides import choices_of
 from ls3_recipes.protocol import run_experiment
 
@@ -50,15 +49,14 @@ def main(arguments: Sequence[str] | None = None, *, algorithm: str | None = None
         arguments.insert(0, f"algorithm={algorithm}")
     resumed = [argument for argument in arguments if argument.startswith("resume=")]
     if resumed:
-        with _exit_code_of_signals(), errors_in_one_line("ls3 train"):
+        with command_line("ls3 train"), errors_in_one_line("ls3 train"):
             resume(resumed[-1].partition("=")[2], [argument for argument in arguments if argument not in resumed])
         return
     try:
         settings = settings_class_of(arguments)
     except ValueError as error:
         raise SystemExit(f"ls3 train: {error}") from None
-    with _exit_code_of_signals():
-        run_command("train", settings, run_experiment, arguments, help_text=help_text())
+    run_command("train", settings, run_experiment, arguments, help_text=help_text())
 
 
 def resume(folder: str, others: Sequence[str] = ()) -> dict:
@@ -78,11 +76,3 @@ def resume(folder: str, others: Sequence[str] = ()) -> dict:
             f"resume={folder} goes on with the settings of that run, and takes no others; got {', '.join(others)}."
         )
     return run_experiment(replace(settings_of_run(folder), output=folder))
-
-
-@contextmanager
-def _exit_code_of_signals() -> Iterator[None]:
-    try:
-        yield
-    except Interrupted as error:
-        raise SystemExit(error.exit_code) from None

@@ -55,7 +55,11 @@ def read_run(folder: str | Path) -> Run:
     folder = Path(folder)
     path = folder / "summary.json"
     if not path.is_file():
-        raise FileNotFoundError(f"{folder} is no folder of a finished run: summary.json is missing.")
+        unfinished = (folder / "config.yaml").is_file()
+        raise FileNotFoundError(
+            f"{folder} is no folder of a finished run: summary.json is missing."
+            + (f" Finish the run with ls3 train resume={folder}, or leave it out." if unfinished else "")
+        )
     summary = read_json(path)
     _check_summary(summary, path)
     rows = [row for row in read_metrics(folder) if row["phase"] == "online"]

@@ -5,7 +5,7 @@ import sys
 import pytest
 import torch
 
-from ls3_recipes import protocol
+from ls3_recipes import offline_data
 from ls3_recipes.benchmark import suite
 from ls3_recipes.commands import collect, main
 from ls3_recipes.protocol import Experiment
@@ -80,10 +80,10 @@ MISTAKES = {
             (*TRAIN, "vae.prediction_weight=1", "vae.prediction_horizon=13"),
             "vae.prediction_horizon must not exceed the 12 steps of an episode, got 13.",
         ),
-        ((*TRAIN, "buffer.capacity=100"), "buffer.capacity must be at least 600, the transitions of the offline data"),
+        ((*TRAIN, "buffer.capacity=100"), "buffer.capacity must be at least 624, the transitions of the offline data"),
         (
             (*TRAIN, "buffer.capacity=20", "buffer.success_tail=1"),
-            "buffer.capacity must be at least 24, the transitions of the episodes of one update; got 20.",
+            "buffer.capacity must be at least 24, the transitions of the offline data and of the episodes",
         ),
         ((*TRAIN, "loss.monte_carlo=true"), "loss.monte_carlo needs buffer.continue_failures=true"),
         ((*TRAIN, "agent.action_scale=[1,2,3]"), "agent.action_scale must be one positive number or one for each of 2"),
@@ -175,7 +175,7 @@ def at_the_door(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["ls3"])
     monkeypatch.setattr(Experiment, "start", work)
-    monkeypatch.setattr(protocol, "collect_demonstrations", work)
+    monkeypatch.setattr(offline_data, "collect_demonstrations", work)
     monkeypatch.setattr(collect, "collect_demonstrations", work)
     monkeypatch.setattr(suite, "matmul_peak", work)
     (tmp_path / "a_file").write_text("precious")
@@ -246,7 +246,7 @@ def test_without_opencv_what_needs_it_is_refused_and_the_rest_runs(at_the_door, 
 
 
 def test_a_folder_that_cannot_be_written_to_is_refused(at_the_door, monkeypatch):
-    monkeypatch.setattr("ls3_recipes.run_folder.os.access", lambda *_: False)
+    monkeypatch.setattr("ls3_recipes.run_files.os.access", lambda *_: False)
     for arguments in (TRAIN, ("collect",), ("benchmark",)):
         line = refusal([*arguments, "output=new/run"])
         assert f"output=new/run cannot be made: {at_the_door} cannot be written to." in line
