@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple, TypeAlias
@@ -68,7 +69,10 @@ class DivergenceError(FloatingPointError):
     def __init__(
         self, phase: str, step: int, scalars: Mapping[str, float], batch: TensorDictBase | None, remedy: str
     ) -> None:
-        super().__init__(f"{phase} diverged: {dict(scalars)} at step {step}. {remedy}")
+        found = (
+            "" if any(not math.isfinite(value) for value in scalars.values()) else ", and its gradient is not finite"
+        )
+        super().__init__(f"{phase} diverged: {dict(scalars)} at step {step}{found}. {remedy}")
         self.phase, self.step, self.scalars, self.batch = phase, step, dict(scalars), batch
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -88,7 +89,11 @@ class RunCheckpoints:
         for path in reversed(self._files()):
             try:
                 _checkpoint(parts).load(path)
+            except MemoryError:
+                raise
             except Exception as error:  # whatever damage makes of a file
+                if is_full(error, Path(tempfile.gettempdir())):  # TorchRL unpacks the archive there
+                    raise
                 damaged.append(f"{path} cannot be read ({' '.join(str(error).split())[:200]})")
                 continue
             for what in damaged:
