@@ -34,7 +34,7 @@ MISTAKES = {
         ),
         ((*TRAIN, "vae.crop_scale=[0.5]"), "vae.crop_scale must be a list of 2 finite numbers, or null, got [0.5]."),
         ((*TRAIN, "loss.mean_latents=goal"), "loss.mean_latents must be a list of texts, got 'goal'."),
-        ((*TRAIN, "output=2024"), "output must be text, got 2024. Put it in quotes"),
+        ((*TRAIN, "output=2024"), "output must be text, or null, got 2024. Put it in quotes"),
         ((*TRAIN, "data=[a,b]"), "data must be text, or null, got ['a', 'b']."),
         ((*TRAIN, "online=3"), "online is a section, got 3: set online.KEY=VALUE."),
         ((*TRAIN, "online=null"), "online is a section, got null: set online.KEY=VALUE."),
