@@ -20,7 +20,7 @@ MAY_IMPORT = {
     "baselines": {"_checks", "modules", "objectives"},
     "files": set(),
     "agent": {"_checks", "files", "modules", "planners"},
-    "trainers": {"_checks", "agent", "data", "layers", "modules", "objectives"},
+    "trainers": {"_checks", "agent", "data", "files", "layers", "modules", "objectives"},
     "__init__": {"agent"},
 }
 

@@ -1,5 +1,6 @@
 """Training as components, on any environment: the VAE, the latent models, and what they know."""
 
+from ls3_torchrl.trainers.checkpoints import Checkpoints, Stateful
 from ls3_torchrl.trainers.diagnostics import StateProbe
 from ls3_torchrl.trainers.learner import AuxiliaryLoss, DivergenceError, Learner, LearnerGroup, Stage
 from ls3_torchrl.trainers.ls3 import LS3Trainer
@@ -15,6 +16,7 @@ from ls3_torchrl.trainers.vae import VAETrainer
 
 __all__ = [
     "AuxiliaryLoss",
+    "Checkpoints",
     "DivergenceError",
     "LS3Options",
     "LS3Trainer",
@@ -26,6 +28,7 @@ __all__ = [
     "OptimOptions",
     "Stage",
     "StateProbe",
+    "Stateful",
     "VAEOptions",
     "VAETrainer",
 ]

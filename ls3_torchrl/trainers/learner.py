@@ -308,21 +308,34 @@ class LearnerGroup:
 
     def __init__(self, learners: Mapping[str, Learner]) -> None:
         self.learners = dict(learners)
-        self._finished = 0  # stages of the list that train() is in
+        self._stages: list[Stage] = []  # the list that train() is in
+        self._finished = 0  # of them
 
     def train(self, stages: Iterable[Stage]) -> None:
-        """Train by a list of stages; after :meth:`load_state_dict`, what is left of the list that was being trained."""
-        for name, steps, phase in list(stages)[self._finished :]:
+        """Train by a list of stages; after :meth:`load_state_dict`, what is left of the list that was being trained.
+
+        Raises:
+            RuntimeError: for another list than the one that was being trained.
+        """
+        wanted = list(stages)
+        if self._stages and wanted != self._stages:
+            raise RuntimeError(
+                f"The state was taken in the middle of other training, in stage {self._finished + 1} of "
+                f"{self._stages}; now {wanted} is asked for. Call first what was being called then."
+            )
+        self._stages = wanted
+        for name, steps, phase in wanted[self._finished :]:
             self.learners[name].train(steps, phase)
             self._finished += 1
-        self._finished = 0
+        self._stages, self._finished = [], 0
 
     def state_dict(self) -> dict[str, Any]:
         """That of every learner, and how far the list of stages was carried out."""
-        return {"finished": self._finished} | {name: learner.state_dict() for name, learner in self.learners.items()}
+        learners = {name: learner.state_dict() for name, learner in self.learners.items()}
+        return {"stages": list(self._stages), "finished": self._finished} | learners
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue where :meth:`state_dict` was taken."""
-        self._finished = state_dict["finished"]
+        self._stages, self._finished = list(state_dict["stages"]), state_dict["finished"]
         for name, learner in self.learners.items():
             learner.load_state_dict(state_dict[name])

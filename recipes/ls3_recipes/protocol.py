@@ -9,7 +9,6 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from ls3_recipes.algorithms import ALGORITHMS
-from ls3_recipes.checkpoints import RunState, Stateful
 from ls3_recipes.console import console, print_summary
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.figures import Figures, best_update, episode_figures, means_of, summarise
@@ -21,9 +20,10 @@ from ls3_recipes.progress import HeldRandomState, Progress, Worlds
 from ls3_recipes.resume import begun_with, open_folder
 from ls3_recipes.rollout import make_env, run_episodes, tick, whole_episodes
 from ls3_recipes.run_settings import RunSettings, decided
+from ls3_recipes.run_state import RunState
 from ls3_recipes.together import require_room, require_tools
 from ls3_torchrl.data import Tag, load_episodes, save_episodes
-from ls3_torchrl.trainers import DivergenceError
+from ls3_torchrl.trainers import DivergenceError, Stateful
 from ls3_torchrl.trainers.learner import log_scalars
 from ls3_torchrl.trainers.progress import progress_bar
 

@@ -9,12 +9,11 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from ls3_recipes.checkpoints import RunCheckpoints
 from ls3_recipes.run_files import require_new
 from ls3_recipes.run_logger import RunLogger
 from ls3_recipes.versions import description
 from ls3_torchrl.files import PARTIAL, new_folder, save_atomically, save_json_atomically, save_text_atomically
-from ls3_torchrl.trainers import DivergenceError
+from ls3_torchrl.trainers import Checkpoints, DivergenceError
 
 try:
     import fcntl
@@ -39,7 +38,7 @@ class RunFolder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._lock = Lock(self.path / "lock")
-        self.states = RunCheckpoints(self.path / "checkpoints")
+        self.states = Checkpoints(self.path / "checkpoints")
         self.logger = RunLogger(self.path)
 
     @classmethod

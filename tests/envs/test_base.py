@@ -163,6 +163,24 @@ def test_set_seed_starts_a_life_anew():
     assert torch.equal(env.reset()["state"], second)
 
 
+def test_the_episodes_that_are_going_on_can_begin_again_elsewhere():
+    env, other = LineEnv(3, seed=1), LineEnv(3, seed=2)
+    env.reset()
+    env.rollout(4)
+    first = env.reset()["state"]
+    part = env.reset(TensorDict({"_reset": torch.tensor([[True], [False], [False]])}, [3]))["state"]
+    other.set_random_state(env.random_state())
+    again = other.reset()["state"]
+    assert torch.equal(again[0], part[0])  # each where its own last episode began
+    assert torch.equal(again[1:], first[1:])
+    assert torch.equal(env.reset()["state"], other.reset()["state"])
+    env.set_seeds([5, None, 6])
+    other.set_random_state(env.random_state())
+    assert torch.equal(env.reset()["state"][[0, 2]], other.reset()["state"][[0, 2]])
+    with pytest.raises(ValueError, match="one stream for each of 3 environments, got 2"):
+        other.set_random_state(env.random_state()[:2])
+
+
 def test_without_a_seed_torchs_generator_decides():
     torch.manual_seed(5)
     first = LineEnv(seed=None).reset()["state"]

@@ -59,9 +59,8 @@ def kill_myself():
 
 def _name_phases(where):
     """Let the process tell what it is doing."""
-    from ls3_recipes.checkpoints import RunCheckpoints
     from ls3_recipes.protocol import Experiment
-    from ls3_torchrl.trainers import Learner, VAETrainer
+    from ls3_torchrl.trainers import Checkpoints, Learner, VAETrainer
 
     def told(cls, method, name):
         function = getattr(cls, method)
@@ -89,7 +88,7 @@ def _name_phases(where):
     told(VAETrainer, "_minimise", "VAE")
     told(VAETrainer, "encode", "encoding")
     told(Learner, "train", None)
-    told(RunCheckpoints, "save", "saving")
+    told(Checkpoints, "save", "saving")
 
 
 def _run(arguments, log, where, moment, wrap):

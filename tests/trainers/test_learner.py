@@ -1,5 +1,8 @@
 """A learner: what it starts from, minimises and follows, how divergence is reported, and how it continues."""
 
+import copy
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -312,3 +315,32 @@ def test_a_group_continues_with_the_learner_that_was_stopped(stop):
         assert second.learners[name].steps == learner.steps
         for key, expected in learner.loss.state_dict().items():
             assert torch.equal(second.learners[name].loss.state_dict()[key], expected), (name, key)
+
+
+def test_a_state_from_the_middle_of_a_list_goes_on_with_no_other_list():
+    stages = [("one", 3, "One"), ("two", 4, "Two")]
+    taken = []
+    first, _ = group_of_two(0)
+    first.learners["two"].after_step = lambda: taken.append(copy.deepcopy(first.state_dict()))
+    first.train(stages)
+    second, _ = group_of_two(1)
+    second.load_state_dict(taken[1])
+    with pytest.raises(RuntimeError, match=r"middle of other training, in stage 2 of .*Call first what was"):
+        second.train([("one", 3, "One")])
+    second.train(stages)
+    assert (second.learners["one"].steps, second.learners["two"].steps) == (3, 4)
+    second.train([("one", 3, "One")])  # that list is done
+    assert second.learners["one"].steps == 6
+
+
+@pytest.mark.parametrize("size", [1e20, 1e30])
+def test_a_gradient_whose_square_overflows_stops_as_well(size):
+    # Adam's average of squares would be infinite for ever, and nothing would move or be said any more.
+    learner, _ = td1_learner(0)
+    weight = learner.parameters[0]
+    before = weight.detach().clone()
+    weight.register_hook(lambda gradient: torch.full_like(gradient, size))
+    with pytest.raises(DivergenceError, match="at step 0, and its gradient is not finite") as caught:
+        learner.train(3, "Value")
+    assert torch.equal(weight, before)
+    assert all(map(math.isfinite, caught.value.scalars.values()))

@@ -1,6 +1,7 @@
 """The two small commands, on what the large one left."""
 
 import json
+import shutil
 
 import pytest
 from omegaconf import OmegaConf
@@ -8,6 +9,7 @@ from PIL import Image
 
 from ls3_recipes.commands.collect import CollectSettings, collect
 from ls3_recipes.commands.evaluate import EvaluateSettings, evaluate
+from ls3_recipes.commands.report import ReportSettings, report
 from ls3_recipes.configuration import compose_settings
 from ls3_torchrl.data import Tag, load_episodes
 
@@ -61,6 +63,31 @@ def test_planner_settings_that_fit_no_planner_are_refused(run_folder, tmp_path):
     with pytest.raises(ValueError, match=r"^planner\.num_elites must lie"):
         evaluated(f"run={run_folder}", "planner.num_elites=1000", f"output={tmp_path / 'evaluation'}")
     assert not (tmp_path / "evaluation").exists()
+
+
+def test_an_agent_that_is_missing_is_named_with_those_that_there_are(run_folder, tmp_path):
+    unfinished = tmp_path / "run"
+    (unfinished / "checkpoints").mkdir(parents=True)
+    for name in ("config.yaml", "checkpoints/agent_000.pt", "checkpoints/agent_001.pt"):
+        shutil.copy(run_folder / name, unfinished / name)
+    said = (
+        r"agent\.pt is missing. The run is not finished: ls3 train resume=.*/run goes on with it. Its newest agent is "
+    )
+    with pytest.raises(FileNotFoundError, match=said + r"agent=checkpoints/agent_001.pt, of 2\."):
+        evaluated(f"run={unfinished}", f"output={tmp_path / 'evaluation'}")
+    assert not (tmp_path / "evaluation").exists()
+    evaluated(f"run={unfinished}", "agent=checkpoints/agent_001.pt", "episodes=1", f"output={tmp_path / 'evaluation'}")
+    with pytest.raises(FileNotFoundError, match=r"agent_009\.pt is missing. Its newest agent is"):
+        evaluated(f"run={run_folder}", "agent=checkpoints/agent_009.pt", f"output={tmp_path / 'other'}")
+
+
+def test_a_report_says_of_an_unfinished_run_how_to_finish_it(run_folder, tmp_path):
+    shutil.copytree(run_folder, tmp_path / "run")
+    (tmp_path / "run" / "summary.json").unlink()
+    with pytest.raises(
+        FileNotFoundError, match=r"summary.json is missing. Finish the run with ls3 train resume=.*/run"
+    ):
+        report(ReportSettings(runs=(str(tmp_path / "run"),), output=str(tmp_path / "report")))
 
 
 def test_evaluate_refuses_a_folder_that_is_no_run(tmp_path):

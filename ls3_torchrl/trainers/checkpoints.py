@@ -1,4 +1,4 @@
-"""The state of a run on disk, from which it continues: TorchRL's checkpoints, made safe against what ends a process."""
+"""States of training on disk, from which it continues: TorchRL's checkpoints, made safe against what ends a process."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ import errno
 import os
 import shutil
 import tempfile
-import time
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, StateDictCheckpointAdapter
 
-from ls3_recipes.console import console
-from ls3_recipes.interrupts import Interrupts
-from ls3_torchrl.files import is_full
+from ls3_torchrl._checks import DataWarning
+from ls3_torchrl.files import is_full, sync_folder
 
 #: Checkpoints kept: the newest, and the one before for when the newest is damaged.
 KEPT = 2
@@ -31,21 +30,21 @@ class Stateful(Protocol):
         """Take a state over."""
 
 
-class RunCheckpoints:
-    """Whole states of a run, the newest two, in files that are whole or not there.
+class Checkpoints:
+    """Whole states of training, the newest two, in files that are whole or not there.
 
     TorchRL's :class:`~torchrl.checkpoint.CheckpointRotation` names, writes and removes them. Here they are forced to
     the disk, what a killed process left behind is removed, a damaged file gives way to the one before it, and a full
     disk is called by its name. Every file is a ZIP archive whose checksums are verified; no code in it is run.
 
     Args:
-        folder: where they lie.
+        folder: where they lie, and no one else's files named ``run-*``.
 
     Example:
         >>> import tempfile
         >>> import torch
         >>> net, other = torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)
-        >>> checkpoints = RunCheckpoints(tempfile.mkdtemp())
+        >>> checkpoints = Checkpoints(tempfile.mkdtemp())
         >>> checkpoints.save({"net": net})
         >>> checkpoints.load({"net": other})
         True
@@ -60,6 +59,10 @@ class RunCheckpoints:
     def save(self, parts: Mapping[str, Stateful]) -> None:
         """Write the state of all parts; the file before stays until this one is on the disk.
 
+        Args:
+            parts: by name: networks, trainers, replay buffers, :class:`~torchrl.checkpoint.GlobalRNGState`, and
+                whatever else has a state.
+
         Raises:
             OSError: when there is no room, naming the folder; what was saved before stays.
         """
@@ -68,21 +71,30 @@ class RunCheckpoints:
         try:
             path = self._rotation.save(_checkpoint(parts), step=step)
             _sync(path)
-            _sync(self.folder)
+            sync_folder(self.folder)
         except (OSError, RuntimeError) as error:
             if is_full(error, self.folder):
                 raise OSError(
                     errno.ENOSPC,
-                    "No space left on device: the run's state could not be saved, and the one saved before is whole",
+                    "No space left on device: the state could not be saved, and the one saved before is whole",
                     str(self.folder),
                 ) from error
             raise
 
     def load(self, parts: Mapping[str, Stateful]) -> bool:
-        """Give all parts the newest state that is whole; ``False`` when there is none.
+        """Give all parts the newest state that is whole.
+
+        Args:
+            parts: those that were saved.
+
+        Returns:
+            Whether there was one.
 
         Raises:
             ValueError: when there are files, and none is whole.
+
+        Warns:
+            DataWarning: when the newest one is damaged, and the one before is taken.
         """
         self.tidy()
         damaged = []
@@ -97,10 +109,10 @@ class RunCheckpoints:
                 damaged.append(f"{path} cannot be read ({' '.join(str(error).split())[:200]})")
                 continue
             for what in damaged:
-                console.print(f"[bold red]{what}[/bold red]; continuing from {path.name}, the one before.")
+                warnings.warn(f"{what}; continuing from {path.name}, the one before.", DataWarning, stacklevel=2)
             return True
         if damaged:
-            raise ValueError(f"{'; '.join(damaged)}. No state of the run is whole: start it again in another folder.")
+            raise ValueError(f"{'; '.join(damaged)}. No state is whole: start again in another folder.")
         return False
 
     def tidy(self) -> None:
@@ -113,7 +125,7 @@ class RunCheckpoints:
         return bool(self._files())
 
     def remove(self) -> None:
-        """Remove all: the run is finished."""
+        """Remove all: training is finished."""
         self.tidy()
         for path in self._files():
             path.unlink()
@@ -121,41 +133,6 @@ class RunCheckpoints:
     def _files(self) -> list[Path]:
         """By name: also those whose beginning is damaged, which TorchRL passes over in silence."""
         return sorted(self.folder.glob("run-*.torchrl"))
-
-
-class RunState:
-    """The parts of a run that continues: saved when something is done, and by the clock while something goes on.
-
-    Args:
-        checkpoints: where to.
-        parts: all that decides what the run will do.
-        interrupts: what asks it to stop.
-        minutes: between the saves of :meth:`after_step`.
-    """
-
-    def __init__(
-        self, checkpoints: RunCheckpoints, parts: Mapping[str, Stateful], interrupts: Interrupts, minutes: float
-    ) -> None:
-        self._checkpoints, self._parts, self._interrupts = checkpoints, parts, interrupts
-        self._seconds = 60.0 * minutes
-        self._saved = time.monotonic()
-
-    def save(self) -> None:
-        """Save now; a signal that comes meanwhile waits."""
-        with self._interrupts.deferred():
-            self._checkpoints.save(self._parts)
-        self._saved = time.monotonic()
-
-    def after_step(self) -> None:
-        """Save when it is time, and leave when a signal waits."""
-        if self._interrupts.pending or time.monotonic() - self._saved > self._seconds:
-            self._checkpoints.save(self._parts)
-            self._saved = time.monotonic()
-            self._interrupts.check()
-
-    def load(self) -> bool:
-        """Take up the newest state that is whole; ``False`` when there is none."""
-        return self._checkpoints.load(self._parts)
 
 
 def _checkpoint(parts: Mapping[str, Stateful]) -> Checkpoint:
@@ -168,8 +145,8 @@ def _checkpoint(parts: Mapping[str, Stateful]) -> Checkpoint:
 
 
 def _sync(path: Path) -> None:
-    """Force a file, or the names in a folder, to the disk."""
-    handle = os.open(path, os.O_RDONLY)
+    """Force a file to the disk."""
+    handle = os.open(path, os.O_RDWR)
     try:
         os.fsync(handle)
     finally:
