@@ -60,6 +60,7 @@ def kill_myself():
 def _name_phases(where):
     """Let the process tell what it is doing."""
     from ls3_recipes.protocol import Experiment
+    from ls3_recipes.run_folder import RunFolder
     from ls3_torchrl.trainers import Checkpoints, Learner, VAETrainer
 
     def told(cls, method, name):
@@ -85,6 +86,7 @@ def _name_phases(where):
         "finish": "results",
     }.items():
         told(Experiment, method, name)
+    told(RunFolder, "thin_out_agents", "planning")  # the last of an update
     told(VAETrainer, "_minimise", "VAE")
     told(VAETrainer, "encode", "encoding")
     told(Learner, "train", None)
