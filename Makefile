@@ -11,12 +11,13 @@ ARGS ?=
 # Threads that wait must not burn the cores that others compute on.
 export OMP_WAIT_POLICY = passive
 
-.PHONY: help run test smoke lint types package check lock clean
+.PHONY: help run test soak smoke lint types package check lock clean
 
 help:
 	@echo "make run    train LS3 on Navigation from pixels; pictures and figures land in runs/"
 	@echo "            (TASK=navigation PRESET=cpu|paper|smoke SEED=0 ARGS='key=value ...')"
 	@echo "make test   install what the tests need and run them"
+	@echo "make soak   the long form of the tests of reliability: kill, signals, full disks, memory; about an hour"
 	@echo "make check  package, tests, lint, format, types and the smoke recipe: what CI runs"
 	@echo "make lock   write constraints.txt anew from this environment"
 
@@ -35,6 +36,9 @@ run: $(VENV)/run.installed
 
 test: $(VENV)/test.installed
 	$(BIN)/python -m pytest
+
+soak: $(VENV)/test.installed
+	$(BIN)/python -m pytest tests/reliability tests/trainers/test_checkpoints.py --soak -s -p no:cacheprovider
 
 lint: $(VENV)/test.installed
 	$(BIN)/ruff check .

@@ -5,6 +5,7 @@ import runpy
 from pathlib import Path
 
 import pytest
+import torch
 
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.benchmark.suite import BenchmarkSettings
@@ -45,6 +46,25 @@ def test_the_python_of_the_other_documents_runs_by_itself():
         exec(compile(block, "comparisons.md", "exec"), {})
 
 
+def test_the_pipeline_that_goes_on_does_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    refill, pipeline = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "reliability.md").read_text(), flags=re.DOTALL
+    )
+    exec(compile(refill, "reliability.md", "exec"), {})  # what it does is a test of continued runs
+    first: dict = {}
+    torch.manual_seed(0)
+    exec(compile(pipeline, "reliability.md", "exec"), first)
+    assert "going on" not in capsys.readouterr().out
+    again: dict = {}
+    torch.manual_seed(0)
+    exec(compile(pipeline, "reliability.md", "exec"), again)
+    assert "going on" in capsys.readouterr().out
+    assert again["trainer"].dynamics.steps == 20  # and not 40
+    for name, weights in first["agent"].state_dict().items():
+        assert torch.equal(weights, again["agent"].state_dict()[name])
+
+
 def commands():
     """What the documents tell to type: ``ls3 COMMAND …`` and ``python recipes/DOOR.py …``, in blocks of shell."""
     for document in DOCUMENTS:
@@ -70,6 +90,8 @@ def test_commands_compose(line):
         command, overrides = words[1], words[2:]
     # The files of runs that the reader will have are not there.
     overrides = [re.sub(r"^(vae\.checkpoint)=.*", rf"\1={ROOT / 'README.md'}", override) for override in overrides]
+    if [word.partition("=")[0] for word in overrides] == ["resume"]:
+        return  # of a run that the reader will have
     if command == "train":
         compose_settings("train", settings_class_of(overrides), overrides)
     elif command in SETTINGS:

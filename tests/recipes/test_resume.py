@@ -1,9 +1,11 @@
 """Which folder a run goes on in, what is refused, and what a run's folder is enough for."""
 
 import json
+import re
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 import torch
@@ -19,11 +21,12 @@ from ls3_recipes.protocol import Experiment, run_experiment
 from ls3_recipes.resume import begun_with, open_folder
 from ls3_recipes.run_folder import AGENTS, RunFolder
 from ls3_recipes.run_settings import decided
-from ls3_torchrl.data import Tag, TaggedReplayBuffer, load_episodes
+from ls3_torchrl.data import Tag, TaggedReplayBuffer
 
 # TorchRL warns about classes of its own while its collectors are imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Creating .* which inherits from WeightUpdaterBase:DeprecationWarning")
 CPU = torch.device("cpu")
+RELIABILITY = Path(__file__).parents[2] / "docs" / "reliability.md"
 
 
 def settings(*overrides):
@@ -264,10 +267,10 @@ def test_a_folder_is_enough_to_rebuild_the_buffer(monkeypatch):
     monkeypatch.setattr(Experiment, "finish", lambda self: [held.append(self.buffer), finish(self)][1])
     run_experiment(settings("output=mine"))
     buffer = TaggedReplayBuffer(35_000, latent_dim=8)
-    folder = settings("output=mine").output
-    for episodes in [f"{folder}/demonstrations", f"{folder}/episodes/update_001", f"{folder}/episodes/update_002"]:
-        for tag, part in load_episodes(episodes, task="navigation").items():
-            buffer.add(part, tag)
+    documented: dict = {}
+    block = re.search(r"```python\n(.*?)```", RELIABILITY.read_text(), flags=re.DOTALL)
+    exec(compile(block[1], "reliability.md", "exec"), documented)
+    documented["refill"](buffer, Path("mine"))
     own = held[0].transitions.storage[:]
     same = [key for key in own.keys(True, True) if key not in ("loc", "scale", ("next", "loc"), ("next", "scale"))]
     assert (buffer.transitions.storage[:].select(*same) == own.select(*same)).all()
