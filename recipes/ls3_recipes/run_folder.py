@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -116,15 +117,25 @@ class Lock:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file = path.open("a")
+        while not self._is_held():  # its holder has removed it in between
+            self._file.close()
+            self._file = path.open("a")
+
+    def _is_held(self) -> bool:
+        """Whether the file is locked now, and still is the one at the path."""
         if fcntl is None:  # on Windows nothing is locked
-            return
+            return True
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             self._file.close()
             raise FileExistsError(
-                f"Another process is writing to {path.parent}. Wait for it, stop it, or choose another output=DIR."
+                f"Another process is writing to {self._path.parent}. Wait for it, stop it, or choose another "
+                "output=DIR."
             ) from None
+        except OSError:  # a file system without locks
+            return True
+        return self._path.exists() and os.path.samestat(self._path.stat(), os.fstat(self._file.fileno()))
 
     def release(self) -> None:
         """Let others in."""

@@ -16,6 +16,7 @@ from torch.utils.tensorboard import SummaryWriter
 from torchrl.record.loggers import Logger
 
 from ls3_recipes.run_files import COLUMNS, read_metrics
+from ls3_torchrl.files import save_text_atomically
 
 
 class RunLogger(Logger):
@@ -87,7 +88,7 @@ class RunLogger(Logger):
         """Continue behind what was logged then; what came after it is removed, from TensorBoard as well."""
         self._csv.close()
         lines = self._path.read_bytes().splitlines(keepends=True)
-        self._path.write_bytes(b"".join(lines[: state_dict["count"] + 1]))
+        save_text_atomically(b"".join(lines[: state_dict["count"] + 1]).decode(), self._path)
         self._open("a")
         self._count, self._earlier = state_dict["count"], state_dict["seconds"]
         self._start = time.perf_counter()

@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torchrl.record.loggers import Logger
 
 from ls3_recipes.run_files import read_metrics
-from ls3_recipes.run_folder import RunFolder
+from ls3_recipes.run_folder import Lock, RunFolder
 from ls3_recipes.run_logger import RunLogger
 
 
@@ -68,3 +68,35 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path):
         folder.write_json("summary.json", {"a": object()})
     folder.close()
     assert json.loads((folder.path / "summary.json").read_text()) == {"a": 1}
+
+
+def test_a_table_that_is_gone_on_with_loses_what_came_after_the_state_and_no_byte_before(tmp_path):
+    logger = RunLogger(tmp_path)
+    logger.log_scalar("a/x", 1.0, step=1)
+    state = logger.state_dict()
+    kept = (tmp_path / "metrics.csv").read_bytes()
+    logger.log_scalar("a/x", 2.0, step=2)
+    logger.close()
+    with (tmp_path / "metrics.csv").open("ab") as file:
+        file.write(b"0.1,a,3,x")  # cut off in the middle of a line
+    again = RunLogger(tmp_path)
+    again.load_state_dict(state)
+    assert (tmp_path / "metrics.csv").read_bytes() == kept
+    again.log_scalar("a/x", 3.0, step=2)
+    again.close()
+    assert [(row["step"], row["value"]) for row in read_metrics(tmp_path)] == [("1", "1"), ("2", "3")]
+    board = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [event.value for event in board.Scalars("a/x")] == [1.0, 3.0]
+
+
+def test_a_lock_that_was_released_and_removed_in_between_is_taken_anew(tmp_path):
+    first = Lock(tmp_path / "lock")
+    with pytest.raises(FileExistsError, match="Another process is writing"):
+        Lock(tmp_path / "lock")
+    first.release()
+    second = Lock(tmp_path / "lock")
+    (tmp_path / "lock").unlink()
+    third = Lock(tmp_path / "lock")  # another file: the old one says nothing
+    assert (tmp_path / "lock").exists()
+    for lock in (second, third):
+        lock.release()
