@@ -18,6 +18,8 @@ from ls3_torchrl.files import is_full, sync_folder
 
 #: Checkpoints kept: the newest, and the one before for when the newest is damaged.
 KEPT = 2
+#: How the name of a file ends that was found damaged.
+DAMAGED = ".damaged"
 
 
 class Stateful(Protocol):
@@ -97,7 +99,7 @@ class Checkpoints:
             DataWarning: when the newest one is damaged, and the one before is taken.
         """
         self.tidy()
-        damaged = []
+        damaged: dict[Path, str] = {}
         for path in reversed(self._files()):
             try:
                 _checkpoint(parts).load(path)
@@ -106,13 +108,14 @@ class Checkpoints:
             except Exception as error:  # whatever damage makes of a file
                 if is_full(error, Path(tempfile.gettempdir())):  # TorchRL unpacks the archive there
                     raise
-                damaged.append(f"{path} cannot be read ({' '.join(str(error).split())[:200]})")
+                damaged[path] = f"{path} cannot be read ({' '.join(str(error).split())[:200]})"
                 continue
-            for what in damaged:
+            for other, what in damaged.items():
+                other.rename(other.with_suffix(DAMAGED))  # else it would be one of the two that are kept
                 warnings.warn(f"{what}; continuing from {path.name}, the one before.", DataWarning, stacklevel=2)
             return True
         if damaged:
-            raise ValueError(f"{'; '.join(damaged)}. No state is whole: start again in another folder.")
+            raise ValueError(f"{'; '.join(damaged.values())}. No state is whole: start again in another folder.")
         return False
 
     def tidy(self) -> None:
@@ -127,7 +130,7 @@ class Checkpoints:
     def remove(self) -> None:
         """Remove all: training is finished."""
         self.tidy()
-        for path in self._files():
+        for path in [*self.folder.glob(f"run-*{DAMAGED}"), *self._files()]:
             path.unlink()
 
     def _files(self) -> list[Path]:

@@ -70,6 +70,16 @@ def test_a_damaged_newest_state_gives_way_to_the_one_before_and_that_is_said(tmp
     newest.write_bytes(newest.read_bytes()[:-200])
     with pytest.warns(DataWarning, match=rf"{newest.name} cannot be read.*the one before"):
         assert loaded(tmp_path) == 1
+    # It takes no place of a whole one.
+    assert not newest.exists()
+    saved(tmp_path, 3)
+    assert loaded(tmp_path) == 3
+    max(tmp_path.glob("*.torchrl")).write_bytes(b"")
+    with pytest.warns(DataWarning, match="the one before"):
+        assert loaded(tmp_path) == 1
+    checkpoints = saved(tmp_path, 4)
+    checkpoints.remove()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_when_no_state_is_whole_nothing_starts_by_itself(tmp_path):
