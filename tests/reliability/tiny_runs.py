@@ -187,6 +187,8 @@ def _names(folder):
 
 
 def _flat(content, where=()):
+    if isinstance(content, list):
+        content = dict(enumerate(content))
     if isinstance(content, dict):
         return {key: value for name, part in content.items() for key, value in _flat(part, (*where, name)).items()}
     return {where: content}
