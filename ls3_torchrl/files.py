@@ -21,7 +21,7 @@ PARTIAL = ".partial"
 _NO_ROOM = 16 * 2**20
 
 
-def save_atomically(content: dict[str, Any], path: str | Path) -> Path:
+def save_atomically(content: Any, path: str | Path) -> Path:
     """``torch.save`` in one go: a half-written file never takes the place of a whole one.
 
     Args:

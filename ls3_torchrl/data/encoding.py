@@ -39,6 +39,7 @@ def encode_frames(
 
     Raises:
         ValueError: for latents of another size.
+        FloatingPointError: for latents that are not finite.
 
     Example:
         >>> from tensordict.nn import TensorDictModule
@@ -57,6 +58,10 @@ def encode_frames(
             require_keys(observations, encoder.in_keys, "The encoder")
             parts.append(encode(encoder, observations))
             _require_size(parts[-1][0], len(part), latent_dim)
+            if not all(torch.isfinite(values).all() for values in parts[-1]):
+                raise FloatingPointError(
+                    "The encoder writes latents that are not finite. Look at its weights, and train it anew."
+                )
             if progress is not None:
                 progress(min(start + chunk, len(frames)), len(frames))
     loc, scale = (torch.cat(values).to(frames.device, torch.float32) for values in zip(*parts, strict=True))

@@ -90,7 +90,7 @@ def reserve_rows(maps: TensorDictBase, start: int, count: int) -> None:
     for leaf in maps.values(True, True):
         if not isinstance(leaf, MemoryMappedTensor) or leaf.filename is None:
             continue
-        row = leaf[0].numel() * leaf.itemsize
+        row = math.prod(leaf.shape[1:]) * leaf.itemsize
         if not row * count:
             continue
         handle = os.open(leaf.filename, os.O_RDWR)

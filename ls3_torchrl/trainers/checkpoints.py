@@ -76,11 +76,9 @@ class Checkpoints:
             sync_folder(self.folder)
         except (OSError, RuntimeError) as error:
             if is_full(error, self.folder):
-                raise OSError(
-                    errno.ENOSPC,
-                    "No space left on device: the state could not be saved, and the one saved before is whole",
-                    str(self.folder),
-                ) from error
+                kept = "the one saved before is whole" if self.exist() else "none was saved before"
+                said = f"No space left on device: the state could not be saved; {kept}"
+                raise OSError(errno.ENOSPC, said, str(self.folder)) from error
             raise
 
     def load(self, parts: Mapping[str, Stateful]) -> bool:
@@ -101,15 +99,19 @@ class Checkpoints:
         self.tidy()
         damaged: dict[Path, str] = {}
         for path in reversed(self._files()):
+            states = {name: _Held() for name in parts}
             try:
-                _checkpoint(parts).load(path)
+                _checkpoint(states).load(path)
             except MemoryError:
                 raise
             except Exception as error:  # whatever damage makes of a file
-                if is_full(error, Path(tempfile.gettempdir())):  # TorchRL unpacks the archive there
-                    raise
+                if is_full(error, unpacked := Path(tempfile.gettempdir())):
+                    said = "No space left on device, where the state is unpacked; make room or set TMPDIR"
+                    raise OSError(errno.ENOSPC, said, str(unpacked)) from error
                 damaged[path] = f"{path} cannot be read ({' '.join(str(error).split())[:200]})"
                 continue
+            for name, part in parts.items():  # when all of them are whole
+                part.load_state_dict(states[name].state)
             for other, what in damaged.items():
                 other.rename(other.with_suffix(DAMAGED))  # else it would be one of the two that are kept
                 warnings.warn(f"{what}; continuing from {path.name}, the one before.", DataWarning, stacklevel=2)
@@ -136,6 +138,19 @@ class Checkpoints:
     def _files(self) -> list[Path]:
         """By name: also those whose beginning is damaged, which TorchRL passes over in silence."""
         return sorted(self.folder.glob("run-*.torchrl"))
+
+
+class _Held:
+    """Holds a state that was read."""
+
+    def __init__(self) -> None:
+        self.state: dict[str, Any] = {}
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.state
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.state = state_dict
 
 
 def _checkpoint(parts: Mapping[str, Stateful]) -> Checkpoint:

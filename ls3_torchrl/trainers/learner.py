@@ -69,11 +69,15 @@ class DivergenceError(FloatingPointError):
     def __init__(
         self, phase: str, step: int, scalars: Mapping[str, float], batch: TensorDictBase | None, remedy: str
     ) -> None:
-        found = (
-            "" if any(not math.isfinite(value) for value in scalars.values()) else ", and its gradient is not finite"
-        )
-        super().__init__(f"{phase} diverged: {dict(scalars)} at step {step}{found}. {remedy}")
+        told = not scalars or any(not math.isfinite(value) for value in scalars.values())
+        found = "" if told else ", and its gradient is not finite"
+        super().__init__(f"{phase} diverged: {dict(scalars) or 'not finite'} at step {step}{found}. {remedy}")
         self.phase, self.step, self.scalars, self.batch = phase, step, dict(scalars), batch
+        self.remedy = remedy
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies and pickles are made of the same arguments."""
+        return type(self), (self.phase, self.step, self.scalars, self.batch, self.remedy)
 
 
 def descend(optimizer: torch.optim.Optimizer, parameters: Iterable[Parameter], value: Tensor) -> bool:
@@ -167,6 +171,7 @@ class Learner:
         self.target: HardUpdate | SoftUpdate | None = None
         self.steps = 0
         self._phase_steps = 0  # of the phase that train() is in; kept for one that continues in the middle
+        self._phase: tuple[int, str] | None = None  # that phase
         self._batch: TensorDictBase | None = None  # the last one
 
     def compute_loss(self) -> tuple[TensorDictBase, Tensor]:
@@ -194,10 +199,21 @@ class Learner:
     def train(self, steps: int, phase: str) -> None:
         """Take ``steps`` gradient steps, which are logged and shown as ``phase``; none where nothing can be trained.
 
-        After :meth:`load_state_dict` of a state from the middle of a phase, those that are left of it.
+        After :meth:`load_state_dict` of a state from the middle of a phase, or where ``after_step`` ended it, those
+        that are left of it.
+
+        Raises:
+            DivergenceError: when a loss or a gradient is not finite.
+            RuntimeError: for another phase than the one that was begun.
         """
         if self.optimizer is None:
             return
+        if self._phase not in (None, (steps, phase)):
+            raise RuntimeError(
+                f"{self._phase_steps} steps of {self._phase} were taken; now {(steps, phase)} is asked for. Call what "
+                "was called then, which takes the steps that are left."
+            )
+        self._phase = (steps, phase)
         self._require_one_precision()
         self._make_target()
         # Networks of this size lose more by waking a second core than they gain by it.
@@ -213,7 +229,7 @@ class Learner:
                 self._phase_steps += 1
                 if self.after_step is not None:
                     self.after_step()
-        self._phase_steps = 0
+        self._phase_steps, self._phase = 0, None
 
     def _require_one_precision(self) -> None:
         kinds = {
@@ -266,6 +282,7 @@ class Learner:
             "optimizer": None if self.optimizer is None else self.optimizer.state_dict(),
             "steps": self.steps,
             "phase_steps": self._phase_steps,
+            "phase": self._phase,
             "has_target": self.target is not None,
             "target_counter": getattr(self.target, "counter", 0),
         }
@@ -281,6 +298,7 @@ class Learner:
         if self.optimizer is not None:
             self.optimizer.load_state_dict(state_dict["optimizer"])
         self.steps, self._phase_steps = state_dict["steps"], state_dict["phase_steps"]
+        self._phase = state_dict["phase"]
 
 
 #: A learner's name, its gradient steps, and what they are shown as.

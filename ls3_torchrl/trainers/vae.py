@@ -130,6 +130,11 @@ class VAETrainer:
         self.encode()
         if self.options.unit_scale and self.options.checkpoint is None and not self._rescaled:
             spread = float(self.buffer.transitions.storage[:]["loc"].std(0).square().mean().sqrt())
+            if not spread > 0.0:
+                raise ValueError(
+                    "All latents are alike, and have no spread to be divided by. Look at the images, or pass "
+                    "VAEOptions(unit_scale=False)."
+                )
             self.agent.encoder.rescale(1.0 / spread)
             self.agent.decoder.rescale(1.0 / spread)
             self._rescaled = True
@@ -147,7 +152,10 @@ class VAETrainer:
                 if self.after_step is not None:
                     self.after_step()
 
-            self.buffer.encode(self.agent.encoder, progress=advance)
+            try:
+                self.buffer.encode(self.agent.encoder, progress=advance)
+            except FloatingPointError as error:
+                raise DivergenceError(PHASE, self.steps, {}, None, "Lower VAEOptions.lr.") from error
 
     def _take_checkpoint(self, path: str) -> None:
         """Take encoder and decoder of a trained agent."""
@@ -252,6 +260,8 @@ class VAETrainer:
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue where :meth:`state_dict` was taken."""
         self.loss.load_state_dict(state_dict["loss"])
+        for parameter in self._learnt:
+            parameter.requires_grad_(True)  # it may have been frozen meanwhile
         self.agent.dynamics.load_state_dict(state_dict["dynamics"])
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.schedule.load_state_dict(state_dict["schedule"])

@@ -116,7 +116,7 @@ def settings_of_run(folder: str | Path) -> RunSettings:
     """
     path = Path(folder) / "config.yaml"
     if not path.is_file():
-        raise FileNotFoundError(f"{folder} is no run folder: config.yaml is missing. Pass run=DIR of a finished run.")
+        raise FileNotFoundError(f"{folder} holds no run: config.yaml is missing. Pass the folder of a run.")
     renamed = rename_settings({"algorithm": "ls3"} | read_yaml(path))
     if renamed["algorithm"] not in [*ALGORITHMS]:  # whatever stands there
         raise ValueError(f"{path}: algorithm must be one of {', '.join(ALGORITHMS)}; got {renamed['algorithm']!r}.")
@@ -260,7 +260,8 @@ def errors_in_one_line(who: str, output: Path | None = None) -> Iterator[None]:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":  # Hydra's own wish for the whole trace
             raise
         said = error.args[0] if isinstance(error, KeyError) and error.args else error
-        raise SystemExit(f"{who}: {' '.join(' '.join([str(said), *notes]).split())}") from None
+        whole = ". ".join([str(said).rstrip("."), *notes]) if notes else str(said)
+        raise SystemExit(f"{who}: {' '.join(whole.split())}") from None
 
 
 def help_of(

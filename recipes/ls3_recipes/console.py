@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from ls3_torchrl._checks import DataWarning
@@ -81,4 +82,6 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     console.print(table)
     for name, value in summary.get("probe", {}).items():
         console.print(f"{name.replace('_', ' ')}: {value:.2f} units of the state")
-    console.print(f"{summary['minutes']:.1f} minutes; everything is in [bold]{folder}[/bold]")
+    console.print(
+        f"{summary['minutes']:.1f} minutes; everything is in [bold]{escape(str(folder))}[/bold]", soft_wrap=True
+    )

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: leave when nothing is half done, and at once when asked again."""
+"""Ctrl-C, SIGTERM and SIGHUP: leave when nothing is half done, and at once when asked again."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from typing import Any
 
 from ls3_recipes.console import console
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+#: The last comes when a terminal is closed or a connection ends; not on Windows.
+_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+#: Heard even where a shell has started the process in the background, and ignores them.
+_ALWAYS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(KeyboardInterrupt):
@@ -38,12 +41,15 @@ class Interrupts:
     A second signal ends the process at once.
 
     Example:
-        >>> with Interrupts() as interrupts, interrupts.deferred():
-        ...     signal.raise_signal(signal.SIGTERM)
-        ...     interrupts.pending
-        Traceback (most recent call last):
-        ...
-        ls3_recipes.interrupts.Interrupted: stopped by SIGTERM
+        >>> try:
+        ...     with Interrupts() as interrupts, interrupts.deferred():
+        ...         signal.raise_signal(signal.SIGTERM)
+        ...         print("This is not cut.")
+        ... except Interrupted as stop:
+        ...     print(stop, stop.exit_code)
+        Stopping as soon as this step is saved; once more ends the run at once.
+        This is not cut.
+        stopped by SIGTERM 143
     """
 
     def __init__(self) -> None:
@@ -59,7 +65,10 @@ class Interrupts:
     def __enter__(self) -> Interrupts:
         """Listen; in another thread than the main one Python cannot, and signals do what they did."""
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._receive) for number in _SIGNALS}
+            for number in _SIGNALS:
+                if signal.getsignal(number) is signal.SIG_IGN and number not in _ALWAYS:
+                    continue  # by nohup
+                self._before[number] = signal.signal(number, self._receive)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -23,6 +23,7 @@ from ls3_recipes.run_settings import RunSettings, decided
 from ls3_recipes.run_state import RunState
 from ls3_recipes.together import require_room, require_tools
 from ls3_torchrl.data import Tag, load_episodes, save_episodes
+from ls3_torchrl.files import is_full, save_atomically
 from ls3_torchrl.trainers import DivergenceError, Stateful
 from ls3_torchrl.trainers.learner import log_scalars
 from ls3_torchrl.trainers.progress import progress_bar
@@ -43,7 +44,7 @@ def run_experiment(settings: RunSettings) -> dict:
     Raises:
         ValueError, FileNotFoundError, FileExistsError: for settings, data or folders that cannot be used; before any
             work is done.
-        Interrupted: for Ctrl-C or SIGTERM, when the state is on the disk.
+        Interrupted: for Ctrl-C, SIGTERM or SIGHUP, when the state is on the disk.
         DivergenceError: when training diverges; what it was computed on is kept in the folder's ``diverged/``.
     """
     with Interrupts() as interrupts:
@@ -62,10 +63,11 @@ def run_experiment(settings: RunSettings) -> dict:
             error.add_note(f"The batch and the state of that moment are in {kept}.")
             raise
         except Exception as error:
-            error.add_note(f"To go on when the cause is removed: ls3 train resume={experiment.folder.path}")
+            if experiment.under_way or is_full(error, experiment.folder.path):
+                error.add_note(f"To go on when the cause is removed: ls3 train resume={experiment.folder.path}")
             raise
         except KeyboardInterrupt:
-            console.print(f"To go on: ls3 train resume={experiment.folder.path}")
+            console.print(f"To go on: ls3 train resume={experiment.folder.path}", markup=False, soft_wrap=True)
             raise
         finally:
             experiment.folder.close()
@@ -89,7 +91,8 @@ class Experiment:
 
     def __init__(self, settings: RunSettings, interrupts: Interrupts) -> None:
         self.device = choose_device(settings.device)
-        self.settings, self.seed = decided(settings, self.device, begun_with(settings)), seeds(settings.seed)
+        self.begun = begun_with(settings)
+        self.settings, self.seed = decided(settings, self.device, self.begun), seeds(settings.seed)
         settings = self.settings
         self.interrupts = interrupts
         assert settings.threads is not None
@@ -109,6 +112,7 @@ class Experiment:
         self.online: list[Figures] = []
         self.tracks: list[torch.Tensor] = []
         self.progress = Progress()
+        self.under_way = False  # all that it needs is there
         self.random = HeldRandomState()
 
     def start(self) -> None:
@@ -138,13 +142,16 @@ class Experiment:
         """Take up the state that was saved last, and the episodes that were collected until then."""
         if not self.state.load():
             self.folder.logger.restart()
-            return
+        checkpoint = self.begun.get("vae", {}).get("checkpoint")
+        if checkpoint is not None and self.settings.vae.checkpoint is None and "vae" not in self.progress.phases:
+            raise FileNotFoundError(f"vae.checkpoint={checkpoint} is gone, and was not taken over yet. Restore it.")
         if "vae" in self.progress.phases:
             self.algorithm.encode()
         for update in range(1, self.progress.collected + 1):
             episodes = load_episodes(self.folder.episodes(update))[Tag.ONLINE]
             self._remember(episodes)
             self.buffer.add(episodes, Tag.ONLINE)
+        self.under_way = True
 
     def train_offline(self) -> None:
         """Carry out the algorithm's offline phases."""
@@ -246,6 +253,7 @@ class Experiment:
             env = make_env(settings.task, settings.evaluation.episodes, self.seed["evaluation"], self.device)
             self.algorithm.prepare(env)
             self.evaluation = run_episodes(env, self.algorithm.policy, what="Evaluation")
+        self.interrupts.check()
         with self.progress.timed("probe"):
             self.probe = self.algorithm.diagnose(self.offline, self.evaluation)
 
@@ -265,9 +273,10 @@ class Experiment:
     def _draw(self) -> dict[str, str]:
         """Draw all pictures; those that failed, with the reasons."""
         folder = self.folder.path
-        torch.save(self.tracks, folder / "online_tracks.pt")
-        failed = draw(pictures_of_run(folder, self.settings.task, self.offline, self.tracks, self.evaluation))
-        return failed | draw(self.algorithm.pictures(folder, self.offline, self.evaluation))
+        save_atomically(self.tracks, folder / "online_tracks.pt")
+        check = self.interrupts.check  # between pictures: C code swallows what a signal raises below it
+        failed = draw(pictures_of_run(folder, self.settings.task, self.offline, self.tracks, self.evaluation), check)
+        return failed | draw(self.algorithm.pictures(folder, self.offline, self.evaluation), check)
 
     def _write(self, summary: dict) -> None:
         summary["minutes"] = self.folder.minutes

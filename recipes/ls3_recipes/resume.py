@@ -9,6 +9,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
+
 from ls3_recipes.console import console
 from ls3_recipes.options import as_dict
 from ls3_recipes.run_files import read_json, read_yaml, require_new, require_writable
@@ -18,8 +20,9 @@ from ls3_recipes.versions import FORMAT, VERSION, description
 
 #: Where runs go that are given no ``output``.
 RUNS = Path("runs")
-#: Settings that say where a run is, and not what it does.
-_PLACE = "output"
+#: Settings that say where a run and what it reads lie, and not what it does; some can be changed when it goes on.
+_PLACES = ("output", "data", "scratch_dir", "vae.checkpoint", "checkpoint_minutes", "pictures")
+CHANGEABLE = ("data", "scratch_dir", "checkpoint_minutes", "pictures")
 #: What stands for a choice that was made when the run began.
 _OPEN = {
     "device": "auto",
@@ -49,10 +52,10 @@ def open_folder(settings: RunSettings) -> RunFolder:
         if not path.exists():
             return RunFolder.make(path, wanted)
         require_same_run(path, wanted)
-        return reopen(path)
+        return reopen(path, settings.data)
     for path in _cut_off(settings):
         with suppress(FileExistsError):  # another process is at it
-            return reopen(path)
+            return reopen(path, settings.data)
     return _make_new(f"{name_of(settings)}-{datetime.now():%Y%m%d-%H%M%S}", wanted)
 
 
@@ -88,7 +91,7 @@ def _make_new(name: str, wanted: Mapping[str, Any]) -> RunFolder:
     while True:
         path = RUNS / (name if number == 1 else f"{name}-{number}")
         try:
-            return RunFolder.make(path, {**wanted, _PLACE: str(path)})
+            return RunFolder.make(path, {**wanted, "output": str(path)})
         except FileExistsError:
             number += 1
 
@@ -98,21 +101,30 @@ def _cut_off(settings: RunSettings) -> Iterator[Path]:
     for path in sorted(RUNS.glob(f"{name_of(settings)}-*"), reverse=True):
         with suppress(OSError, ValueError):
             require_same_run(path, as_dict(settings))
-            if read_json(path / "versions.json") == description():
+            if read_json(path / "versions.json") == description(settings.data):
                 yield path
 
 
-def reopen(path: Path) -> RunFolder:
+def reopen(path: Path, data: str | None) -> RunFolder:
     """The folder of an unfinished run.
 
+    Args:
+        path: of the folder.
+        data: the folder of episodes that it goes on with.
+
     Raises:
-        FileExistsError: while another process writes to it.
+        FileExistsError: while another process writes to it, and for other episodes than those that it began with.
     """
+    now, there = description(data), read_json(path / "versions.json")
+    if now["data"] != there.get("data"):
+        raise FileExistsError(
+            f"The run in {path} began with other episodes than those in data={data}. Restore them, or choose another "
+            "output=DIR."
+        )
     folder = RunFolder(path)
     folder.tidy()
-    console.print(f"Continuing the run in [bold]{path}[/bold], which was cut off.")
-    there = read_json(path / "versions.json")
-    changed = [name for name, value in description().items() if there.get(name) != value]
+    console.print(f"Continuing the run in [bold]{escape(str(path))}[/bold], which was cut off.", soft_wrap=True)
+    changed = [name for name, value in now.items() if there.get(name) != value]
     if changed:
         console.print(
             f"[bold red]{', '.join(changed)} changed since it began[/bold red]: what follows need not be what an "
@@ -136,9 +148,14 @@ def require_same_run(path: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
     return there
 
 
+def is_finished(path: str | Path) -> bool:
+    """Whether nothing of a run is left to be done."""
+    return (Path(path) / "summary.json").is_file() and not any((Path(path) / "checkpoints").glob("run-*"))
+
+
 def require_unfinished(path: Path) -> None:
     """Raise ``FileExistsError`` for a run that is finished, or that a version of old left, which kept no state."""
-    if (path / "summary.json").is_file() and not any((path / "checkpoints").glob("run-*")):
+    if is_finished(path):
         raise FileExistsError(
             f"The run in {path} is finished, and no run overwrites another. Choose another output=DIR, or move it away."
         )
@@ -156,5 +173,5 @@ def _differences(there: Mapping[str, Any], wanted: Mapping[str, Any], where: str
         one, other = there.get(key), wanted.get(key)
         if isinstance(one, Mapping) and isinstance(other, Mapping):
             yield from _differences(one, other, f"{where}{key}.")
-        elif one != other and where + key != _PLACE and (where + key, other) not in _OPEN.items():
+        elif one != other and where + key not in _PLACES and (where + key, other) not in _OPEN.items():
             yield f"{where}{key}={one!r} there, {other!r} here"

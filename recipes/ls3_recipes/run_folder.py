@@ -51,7 +51,7 @@ class RunFolder:
         """
         with new_folder(require_new(path)) as new:  # with both files or not at all
             save_text_atomically(OmegaConf.to_yaml(OmegaConf.create(dict(settings))), new / "config.yaml")
-            save_json_atomically(description(), new / "versions.json")
+            save_json_atomically(description(settings.get("data")), new / "versions.json")
         return cls(path)
 
     def tidy(self) -> None:
@@ -69,8 +69,8 @@ class RunFolder:
         """
         interval = -(-updates // AGENTS)
         for path in (self.path / "checkpoints").glob("agent_*.pt"):
-            update = int(path.stem.removeprefix("agent_"))
-            if update % interval and update not in others:
+            number = path.stem.removeprefix("agent_")
+            if number.isdecimal() and int(number) % interval and int(number) not in others:
                 path.unlink()
 
     @property
@@ -100,8 +100,10 @@ class RunFolder:
 
     def close(self) -> None:
         """Flush and close what is open, and leave the folder to others."""
-        self.logger.close()
-        self._lock.release()
+        try:
+            self.logger.close()
+        finally:
+            self._lock.release()
 
 
 class Lock:

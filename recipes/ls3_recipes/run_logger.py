@@ -6,7 +6,9 @@ import csv
 import os
 import shutil
 import time
+import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from torch.utils.tensorboard import SummaryWriter
 from torchrl.record.loggers import Logger
 
 from ls3_recipes.run_files import COLUMNS, read_metrics
+from ls3_torchrl._checks import DataWarning
 from ls3_torchrl.files import save_text_atomically
 
 
@@ -61,9 +64,12 @@ class RunLogger(Logger):
     def log_scalar(self, name: str, value: float, step: int | None = None) -> None:
         """One metric; what stands before the last slash of its name is its phase."""
         phase, _, metric = name.rpartition("/")
-        self._rows.writerow([f"{self.seconds:.1f}", phase, step, metric, f"{value:.6g}"])
+        try:
+            self._rows.writerow([f"{self.seconds:.1f}", phase, step, metric, f"{value:.6g}"])
+            self._csv.flush()
+        except OSError as error:
+            raise OSError(error.errno, f"{error.strerror}; a metric could not be written", str(self._path)) from error
         self._count += 1
-        self._csv.flush()
         self.experiment.add_scalar(name, value, step)
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **options: Any) -> None:
@@ -88,6 +94,13 @@ class RunLogger(Logger):
         """Continue behind what was logged then; what came after it is removed, from TensorBoard as well."""
         self._csv.close()
         lines = self._path.read_bytes().splitlines(keepends=True)
+        if len(lines) <= state_dict["count"]:
+            warnings.warn(
+                f"{self._path} has {max(len(lines) - 1, 0)} rows, where {state_dict['count']} were written; the others "
+                "are lost.",
+                DataWarning,
+                stacklevel=2,
+            )
         save_text_atomically(b"".join(lines[: state_dict["count"] + 1]).decode(), self._path)
         self._open("a")
         self._count, self._earlier = state_dict["count"], state_dict["seconds"]
@@ -95,19 +108,20 @@ class RunLogger(Logger):
         self.experiment.close()
         shutil.rmtree(Path(self.log_dir) / self.exp_name, ignore_errors=True)
         board = self._create_experiment()
-        for row in read_metrics(self.log_dir):
-            board.add_scalar(f"{row['phase']}/{row['name']}", float(row["value"]), int(row["step"]))
+        with suppress(ValueError):  # a table that somebody has changed: the board lacks what follows
+            for row in read_metrics(self.log_dir):
+                board.add_scalar(f"{row['phase']}/{row['name']}", float(row["value"]), int(row["step"]))
         self.experiment = board
 
     def restart(self) -> None:
-        """Remove all that was logged."""
-        if self._count:
-            self.load_state_dict({"count": 0, "seconds": 0.0})
+        """Remove all that was logged, half a line included."""
+        self.load_state_dict({"count": 0, "seconds": 0.0})
 
     def close(self, timeout: float | None = None) -> None:
         """Write what is left, and close table and board."""
-        self._csv.close()
-        super().close(timeout)
+        with suppress(OSError):  # on a full disk: each row was flushed when it was written, or said to have failed
+            self._csv.close()
+            super().close(timeout)
 
     def __repr__(self) -> str:
         return f"RunLogger({self.log_dir!r})"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import torch
@@ -212,6 +213,9 @@ def decided(settings: S, device: torch.device, begun: Mapping[str, Any]) -> S:
     changes: dict[str, Any] = {"device": str(device)}
     if settings.threads is None:
         changes["threads"] = begun.get("threads") or torch.get_num_threads()
+    for name in ("data", "scratch_dir"):
+        if (path := getattr(settings, name)) is not None:
+            changes[name] = str(Path(path).absolute())  # it goes on from other folders as well
     choices = {"vae": "autocast", "optim": "autocast", "planner": "precision"}
     for name, choice in choices.items():
         section = getattr(settings, name, None)

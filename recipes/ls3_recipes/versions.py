@@ -31,9 +31,22 @@ def code() -> str:
     return digest.hexdigest()
 
 
-def description() -> dict[str, Any]:
-    """What ``versions.json`` of a run that starts now says."""
-    return {"format": FORMAT, "version": VERSION, "code": code(), "processor": processor(), **versions()}
+def description(data: str | None) -> dict[str, Any]:
+    """What ``versions.json`` of a run that starts now says.
+
+    Args:
+        data: the folder of episodes that it is given.
+    """
+    about = {"format": FORMAT, "version": VERSION, "code": code(), "processor": processor()}
+    return {**about, "data": None if data is None else _digest(Path(data)), **versions()}
+
+
+def _digest(data: Path) -> str:
+    """Of a folder of episodes: of its descriptions, which hold checksums of the rest."""
+    digest = blake2b(digest_size=16)
+    for path in sorted(data.rglob("*.json")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def versions() -> dict[str, str]:

@@ -237,6 +237,21 @@ def test_what_is_kept_is_kept_by_a_restored_buffer_too(tmp_path, scratch, way):
     assert (buffer.frames.storage[:] == other.frames.storage[:]).all()
 
 
+@pytest.mark.parametrize("way", ["state_dict", "dumps"])
+def test_a_buffer_with_content_takes_over_what_was_saved(tmp_path, scratch, way):
+    camera = Camera()
+    buffer, other = (TaggedReplayBuffer(20, latent_dim=D, scratch_dir=scratch and scratch / name) for name in "ab")
+    buffer.add(camera.shoot(5), "success")
+    other.add(camera.shoot(9), "online")
+    if way == "dumps":
+        buffer.dumps(tmp_path / "saved")
+        other.loads(tmp_path / "saved")
+    else:
+        other.load_state_dict(buffer.state_dict())
+    assert (other.frames.storage[:] == buffer.frames.storage[:]).all()
+    assert other.count(tags=["success"]) == len(other) == 5
+
+
 def test_offline_data_that_cannot_all_be_kept_are_refused_whole():
     camera = Camera()
     buffer = TaggedReplayBuffer(10, latent_dim=D)

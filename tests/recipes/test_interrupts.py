@@ -22,6 +22,21 @@ def test_a_signal_is_an_exception_with_the_shells_code(number, code, said):
     assert isinstance(raised.value, KeyboardInterrupt)  # nothing that catches errors catches it
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="the system has no such signal")
+def test_the_end_of_a_connection_stops_a_run_but_not_one_under_nohup():
+    with pytest.raises(Interrupted, match="stopped by SIGHUP") as raised, Interrupts():
+        signal.raise_signal(signal.SIGHUP)
+    assert raised.value.exit_code == 129
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Interrupts() as interrupts:
+            signal.raise_signal(signal.SIGHUP)
+            assert not interrupts.pending
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def test_a_signal_waits_for_the_end_of_what_must_not_be_cut():
     done = []
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -19,9 +20,11 @@ from ls3_recipes.options import as_dict
 from ls3_recipes.progress import HeldRandomState, Progress
 from ls3_recipes.protocol import Experiment, run_experiment
 from ls3_recipes.resume import begun_with, open_folder
+from ls3_recipes.rollout import collect_demonstrations
+from ls3_recipes.run_files import read_metrics
 from ls3_recipes.run_folder import AGENTS, RunFolder
 from ls3_recipes.run_settings import decided
-from ls3_torchrl.data import Tag, TaggedReplayBuffer
+from ls3_torchrl.data import Tag, TaggedReplayBuffer, save_episodes
 
 # TorchRL warns about classes of its own while its collectors are imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Creating .* which inherits from WeightUpdaterBase:DeprecationWarning")
@@ -213,8 +216,13 @@ def test_what_was_asked_for_by_name_is_not_another_run_s_choice():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["resume=nowhere"], "nowhere is no run folder"),
-        (["resume=mine", "seed=3"], "goes on with the settings of that run, and takes no others; got seed=3"),
+        (["resume=nowhere"], "nowhere holds no run: config.yaml is missing"),
+        (
+            ["resume=mine", "seed=3"],
+            "only data, scratch_dir, checkpoint_minutes, pictures may be given anew, got seed=3",
+        ),
+        (["resume=mine", "checkpoint_minutes=often"], "checkpoint_minutes must be a finite number, got 'often'"),
+        (["resume="], "resume needs the folder of a run"),
     ],
 )
 def test_what_cannot_be_resumed_is_refused_in_one_line(arguments, said):
@@ -229,8 +237,79 @@ def test_a_run_is_resumed_by_its_folder(monkeypatch, capsys):
     path = begun("output=mine", "online.updates=0")
     main([f"resume={path}"])
     assert (path / "summary.json").is_file()
-    with pytest.raises(SystemExit, match="is finished"):
-        main([f"resume={path}"])
+    main([f"resume={path}"])  # a loop that starts it until it succeeds comes to its end
+    assert "is finished: nothing is left to do" in capsys.readouterr().out.replace("\n", " ")
+
+
+# --- what lies elsewhere now, or is gone ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def episodes(tmp_path):
+    """A function that makes a folder of episodes of a seed."""
+
+    def make(name, seed):
+        shutil.rmtree(tmp_path / name, ignore_errors=True)
+        offline = collect_demonstrations(settings().task, seed)
+        return save_episodes(offline, tmp_path / name, task="navigation", seed=seed)
+
+    return make
+
+
+def test_other_episodes_than_those_it_began_with_are_refused(episodes, tmp_path):
+    data = episodes("data", 0)
+    begun("output=mine", f"data={data}")
+    episodes("data", 1)
+    with pytest.raises(FileExistsError, match="began with other episodes than those in data="):
+        begun("output=mine", f"data={data}")
+    episodes("data", 0)
+    begun("output=mine", f"data={data}")
+    (tmp_path / "data").rename(tmp_path / "moved")
+    begun("output=mine", f"data={tmp_path / 'moved'}")
+
+
+def test_places_may_be_others_when_a_run_goes_on(monkeypatch, episodes, tmp_path):
+    monkeypatch.setattr(ls3, "probe", lambda *_: {})
+    data = episodes("data", 0)
+    begun("output=mine", "online.updates=0", f"data={data}", f"scratch_dir={tmp_path / 'scratch'}")
+    data.rename(tmp_path / "moved")
+    with pytest.raises(SystemExit, match="data"):
+        main(["resume=mine"])
+    main(["resume=mine", f"data={tmp_path / 'moved'}", f"scratch_dir={tmp_path / 'other'}", "checkpoint_minutes=7"])
+    assert Path("mine/summary.json").is_file()
+
+
+def test_a_vae_that_is_gone_is_not_trained_anew_in_its_place(run_folder, tmp_path):
+    shutil.copy(run_folder / "agent.pt", tmp_path / "vae.pt")
+    begun("output=mine", f"vae.checkpoint={tmp_path / 'vae.pt'}")
+    (tmp_path / "vae.pt").unlink()
+    with pytest.raises(SystemExit, match=r"vae.checkpoint=.*vae.pt is gone, and was not taken over yet"):
+        main(["resume=mine"])
+
+
+@pytest.mark.parametrize("name", ["br[x]acket", "br[/b]k", "a b ü"])
+def test_a_folder_of_any_name_is_named_as_it_is(capsys, name):
+    begun(f"output='{name}'")
+    begun(f"output='{name}'")
+    assert f"Continuing the run in {name}," in capsys.readouterr().out
+
+
+def test_a_table_of_metrics_that_was_torn_before_the_first_state_is_begun_anew(monkeypatch):
+    monkeypatch.setattr(ls3, "probe", lambda *_: {})
+    path = begun("output=mine", "online.updates=0")
+    with (path / "metrics.csv").open("a") as file:
+        file.write("0.1,VAE,0,lo")
+    main([f"resume={path}"])
+    assert {row["phase"] for row in read_metrics(path)} >= {"VAE", "Goal"}
+
+
+def test_an_agent_of_another_name_is_left_alone():
+    folder = RunFolder.make("run", {})
+    (folder.path / "checkpoints").mkdir(exist_ok=True)
+    (folder.path / "checkpoints" / "agent_best.pt").write_bytes(b"mine")
+    folder.thin_out_agents(300, 0)
+    assert (folder.path / "checkpoints" / "agent_best.pt").is_file()
+    folder.close()
 
 
 # --- what is on the disk ----------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from torchrl.record.loggers import Logger
 from ls3_recipes.run_files import read_metrics
 from ls3_recipes.run_folder import Lock, RunFolder
 from ls3_recipes.run_logger import RunLogger
+from ls3_torchrl.data import DataWarning
 
 
 def test_scalars_go_to_the_table_and_to_tensorboard(tmp_path):
@@ -87,6 +88,20 @@ def test_a_table_that_is_gone_on_with_loses_what_came_after_the_state_and_no_byt
     assert [(row["step"], row["value"]) for row in read_metrics(tmp_path)] == [("1", "1"), ("2", "3")]
     board = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert [event.value for event in board.Scalars("a/x")] == [1.0, 3.0]
+
+
+def test_rows_that_are_gone_are_said(tmp_path):
+    logger = RunLogger(tmp_path)
+    for step in range(3):
+        logger.log_scalar("a/x", 1.0, step=step)
+    state = logger.state_dict()
+    logger.close()
+    lines = (tmp_path / "metrics.csv").read_bytes().splitlines(keepends=True)
+    (tmp_path / "metrics.csv").write_bytes(b"".join(lines[:2]))
+    again = RunLogger(tmp_path)
+    with pytest.warns(DataWarning, match="has 1 rows, where 3 were written; the others are lost"):
+        again.load_state_dict(state)
+    again.close()
 
 
 def test_a_lock_that_was_released_and_removed_in_between_is_taken_anew(tmp_path):

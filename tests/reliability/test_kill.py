@@ -36,7 +36,7 @@ def uncut(tmp_path_factory):
 
 def kill_by_phase(uncut, folder, phase, chance):
     """Kill a run soon after it has begun a phase."""
-    run = Run([*uncut.arguments, ALWAYS, f"output={folder}"], f"{folder}.log").begun()
+    run = Run([*uncut.arguments, ALWAYS, f"output={folder}"], f"{folder}.log", hold=phase).begun()
     while run.phase != phase and run.process.is_alive():
         time.sleep(0.0002)
     time.sleep(0.05 * chance.random() ** 3)

@@ -21,9 +21,9 @@ def uncut(tmp_path_factory):
 def test_a_signal_saves_and_leaves(uncut, tmp_path, soak, number, code):
     chance, slowest = random.Random(int(number)), 0.0
     phases = [phase for phase in PHASES if phase != "saving"]
-    for phase in phases if soak else chance.sample(phases, 2):
-        folder = tmp_path / phase
-        run = Run([*LS3, NEVER, f"output={folder}"], tmp_path / "log").begun()
+    for place, phase in enumerate(phases if soak else chance.sample(phases, 2)):
+        folder = tmp_path / f"run{place}"
+        run = Run([*LS3, NEVER, f"output={folder}"], tmp_path / "log", hold=phase).begun()
         while run.phase != phase and run.process.is_alive():
             time.sleep(0.0002)
         time.sleep(0.02 * chance.random())

@@ -57,8 +57,8 @@ def kill_myself():
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _name_phases(where):
-    """Let the process tell what it is doing."""
+def _name_phases(where, hold):
+    """Let the process tell what it is doing, and pause where ``hold`` begins: it may be over in a millisecond."""
     from ls3_recipes.protocol import Experiment
     from ls3_recipes.run_folder import RunFolder
     from ls3_torchrl.trainers import Checkpoints, Learner, VAETrainer
@@ -69,6 +69,8 @@ def _name_phases(where):
         def call(self, *args, **kwargs):
             before = where.value
             where.value = (name or args[1]).encode()[:60]
+            if where.value.decode() == hold:
+                time.sleep(0.02)
             out = function(self, *args, **kwargs)
             if method == "save":
                 where.value = before
@@ -93,7 +95,7 @@ def _name_phases(where):
     told(Checkpoints, "save", "saving")
 
 
-def _run(arguments, log, where, moment, wrap):
+def _run(arguments, log, where, moment, hold):
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(handle, 1)
     os.dup2(handle, 2)
@@ -102,9 +104,7 @@ def _run(arguments, log, where, moment, wrap):
     from ls3_recipes.commands.train import main
 
     ls3.probe = lambda *_: {}  # takes most of a tiny run's time, and changes nothing that is learnt
-    _name_phases(where)
-    if wrap is not None:
-        wrap()
+    _name_phases(where, hold)
     if moment is not None:
         moment.arm()
     where.value = b"start"
@@ -120,13 +120,13 @@ class Run:
         arguments: of ``ls3 train``.
         log: file that what it says is added to.
         moment: at which it ends itself.
-        wrap: called in its process before it begins.
+        hold: phase at whose beginning it pauses.
     """
 
-    def __init__(self, arguments, log, moment=None, wrap=None):
+    def __init__(self, arguments, log, moment=None, hold=None):
         self.log = Path(log)
         self._where = CONTEXT.Array("c", 64)
-        self.process = CONTEXT.Process(target=_run, args=(list(arguments), str(log), self._where, moment, wrap))
+        self.process = CONTEXT.Process(target=_run, args=(list(arguments), str(log), self._where, moment, hold))
         self.process.start()
 
     @property
@@ -141,8 +141,9 @@ class Run:
         return self
 
     def send(self, number):
-        """Send it a signal."""
-        os.kill(self.process.pid, number)
+        """Send it a signal, unless it has ended."""
+        if self.process.is_alive():
+            os.kill(self.process.pid, number)
 
     def ended(self, timeout=120):
         """Wait for its end; its exit code, negative for a signal."""

@@ -2,6 +2,7 @@
 
 import copy
 import math
+import pickle
 
 import pytest
 import torch
@@ -344,3 +345,28 @@ def test_a_gradient_whose_square_overflows_stops_as_well(size):
         learner.train(3, "Value")
     assert torch.equal(weight, before)
     assert all(map(math.isfinite, caught.value.scalars.values()))
+
+
+def test_a_phase_that_was_ended_goes_on_and_no_other_begins_in_its_place():
+    learner, _ = td1_learner(0)
+
+    def stop():
+        if learner.steps == 2:
+            learner.after_step = None
+            raise InterruptedError
+
+    learner.after_step = stop
+    with pytest.raises(InterruptedError):
+        learner.train(10, "Value")
+    with pytest.raises(RuntimeError, match=r"2 steps of \(10, 'Value'\) were taken; now \(7, 'Other'\)"):
+        learner.train(7, "Other")
+    learner.train(10, "Value")
+    assert learner.steps == 10
+    learner.train(7, "Other")
+    assert learner.steps == 17
+
+
+def test_an_error_of_divergence_crosses_processes():
+    error = DivergenceError("Value", 7, {"loss_value": float("nan")}, None, "Lower its learning rate.")
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.phase, again.step) == (str(error), "Value", 7)

@@ -1,5 +1,7 @@
 """The VAE's training: what encoder and decoder learn from, what is said when they learn nothing, how it continues."""
 
+import copy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -8,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import EpisodeKeys, TaggedReplayBuffer
 from ls3_torchrl.objectives import VAELoss
-from ls3_torchrl.trainers import VAEOptions, VAETrainer
+from ls3_torchrl.trainers import DivergenceError, VAEOptions, VAETrainer
 
 FAST = {"steps": 3, "batch_size": 4, "crop_scale": None, "autocast": False}
 
@@ -254,3 +256,36 @@ def test_a_loss_that_is_not_finite_stops_the_training(make_agent, filled, monkey
     monkeypatch.setattr(VAELoss, "forward", lambda self, td: TensorDict(nothing))
     with pytest.raises(FloatingPointError, match="VAE diverged"):
         VAETrainer(make_agent(), filled(), VAEOptions(**FAST), progress=False).train()
+
+
+def test_it_can_be_taken_back_to_an_earlier_state(make_agent, filled):
+    states = []
+    buffer = filled()
+    trainer = VAETrainer(
+        make_agent(),
+        buffer,
+        VAEOptions(**FAST),
+        progress=False,
+        after_step=lambda: states.append((copy.deepcopy(trainer.state_dict()), torch.get_rng_state())),
+    )
+    trainer.train()
+    ended = {key: value.clone() for key, value in trainer.agent.state_dict().items()}
+    state, random = states[0]
+    trainer.load_state_dict(state)
+    torch.set_rng_state(random)
+    trainer.train()
+    assert all(torch.equal(value, ended[key]) for key, value in trainer.agent.state_dict().items())
+
+
+def test_a_vae_that_explodes_in_its_last_step_is_blamed_itself(make_agent, filled):
+    buffer = filled()
+    with pytest.raises(DivergenceError, match=r"^VAE diverged: not finite at step 1\. Lower") as raised:
+        VAETrainer(make_agent(), buffer, VAEOptions(**{**FAST, "steps": 1, "lr": 1e30}), progress=False).train()
+    assert raised.value.phase == "VAE"
+    assert not buffer.transitions.storage[:]["loc"].any()  # nothing was stored
+
+
+def test_latents_without_a_spread_are_not_divided_by_it(make_agent, filled, episode):
+    buffer = filled(episode(grey=51))
+    with pytest.raises(ValueError, match="All latents are alike"):
+        VAETrainer(make_agent(), buffer, VAEOptions(**FAST, unit_scale=True), progress=False).train()

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from torch.utils.benchmark import Timer
 
@@ -103,4 +104,4 @@ def show(rows: list[dict[str, Any]], folder: Path) -> None:
     rule = "|---|" + "---:|" * (len(columns) - 1)
     text = [f"| {' | '.join(line)} |" for line in (columns, *lines)]
     (folder / "benchmark.md").write_text("\n".join([text[0], rule, *text[1:], "", caption, ""]), encoding="utf-8")
-    console.print(f"benchmark.json and benchmark.md are in [bold]{folder}[/bold]")
+    console.print(f"benchmark.json and benchmark.md are in [bold]{escape(str(folder))}[/bold]")

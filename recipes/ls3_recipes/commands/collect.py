@@ -71,7 +71,7 @@ def collect(settings: CollectSettings) -> Path:
             f"{tag.name.lower():<12} {figures['episodes']} episodes, success {success}, violation {violation}, "
             f"return {returns}"
         )
-    console.print(f"Saved in [bold]{folder}[/bold]; train on them with data={folder}")
+    console.print(f"Saved in {folder}; train on them with data={folder}", markup=False)
     return folder
 
 

@@ -107,8 +107,8 @@ def _require_agent(file: Path, run: Path) -> None:
     unfinished = not (run / "summary.json").is_file()
     raise FileNotFoundError(
         f"{file} is missing."
-        + (f" The run is not finished: ls3 train resume={run} goes on with it." if unfinished else "")
-        + (f" Its newest agent is agent={there[-1]}, of {len(there)}." if there else " It has left no agent.")
+        + (f" The newest agent of the run is agent={there[-1]}." if there else " The run has saved no agent yet.")
+        + (f" It is not finished: ls3 train resume={run} goes on with it." if unfinished else "")
     )
 
 

@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         except (ValueError, OSError) as error:
             raise SystemExit(f"{who}: {error}") from None
         chosen.file.parent.mkdir(parents=True, exist_ok=True)
-        console.print(f"The domains are in [bold]{plot_gallery(chosen.file, chosen.domains)}[/bold]")
+        console.print(f"The domains are in {plot_gallery(chosen.file, chosen.domains)}", markup=False)
 
 
 def _require_picture(path: Path) -> None:

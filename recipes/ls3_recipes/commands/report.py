@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from rich.markup import escape
 from rich.table import Table
 
 import ls3_envs  # noqa: F401  (before TorchRL, which imports MuJoCo: whatever MUJOCO_GL says)
@@ -78,7 +79,7 @@ def report(settings: ReportSettings) -> list[dict[str, str]]:
     (folder / "comparison.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     draw({"comparison.png": lambda: plot_report(runs, LABELS, folder / "comparison.png")})
     _print(rows, f"{runs[0].summary['task']}: mean ± standard error over seeds")
-    console.print(f"Picture and table are in [bold]{folder}[/bold]")
+    console.print(f"Picture and table are in [bold]{escape(str(folder))}[/bold]")
     return rows
 
 

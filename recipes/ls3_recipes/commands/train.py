@@ -5,13 +5,19 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import get_type_hints
+
+import yaml
 
 import ls3_envs  # noqa: F401  (before TorchRL, which imports MuJoCo: whatever MUJOCO_GL says)
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.configuration import errors_in_one_line, run_command, settings_class_of, settings_of_run
-from ls3_recipes.console import command_line
+from ls3_recipes.console import command_line, console
 from ls3_recipes.overrides import choices_of
 from ls3_recipes.protocol import run_experiment
+from ls3_recipes.resume import CHANGEABLE, is_finished
+from ls3_recipes.run_settings import RunSettings
+from ls3_recipes.typed import typed
 
 
 def help_text() -> str:
@@ -26,7 +32,8 @@ Learn a task from images, safely.
 Collects demonstrations (or reads data=DIR), trains offline, improves online, evaluates, and leaves a folder with
 metrics, checkpoints, summary.json and pictures. With algorithm=sacfd recovery=true: SACfD+RRL.
 
-A run that was cut off goes on, to the same result as one that was not: with the same command, or with resume=DIR.
+A run that was cut off goes on, to the same result as one that was not: with the same command, or with resume=DIR, to
+which {", ".join(CHANGEABLE)} may be added, where things lie elsewhere now.
 
 Presets: cpu (minutes on two cores), paper (Table 1 to the letter), smoke (does everything run?)
 
@@ -64,15 +71,25 @@ def resume(folder: str, others: Sequence[str] = ()) -> dict:
 
     Args:
         folder: of the run.
-        others: other arguments of the command line: there are none, since the run has its settings.
+        others: other arguments of the command line: where things lie now, such as ``data=DIR``.
 
     Raises:
-        ValueError: for other arguments.
+        ValueError: for other arguments than these.
         FileNotFoundError: for a folder that holds no run.
-        FileExistsError: for a run that is finished or that another process is at.
+        FileExistsError: for a run that another process is at.
     """
-    if others:
+    if not folder:
+        raise ValueError("resume needs the folder of a run: resume=DIR.")
+    given = dict(other.split("=", 1) for other in others if "=" in other)
+    if len(given) < len(others) or not set(given) <= set(CHANGEABLE):
         raise ValueError(
-            f"resume={folder} goes on with the settings of that run, and takes no others; got {', '.join(others)}."
+            f"resume={folder} goes on with the settings of that run; only {', '.join(CHANGEABLE)} may be given anew, "
+            f"got {', '.join(others)}."
         )
-    return run_experiment(replace(settings_of_run(folder), output=folder))
+    trained = settings_of_run(folder)
+    if is_finished(folder):
+        console.print(f"The run in {folder} is finished: nothing is left to do.", markup=False)
+        return {}
+    hints = get_type_hints(RunSettings)
+    values = {name: typed(yaml.safe_load(value), hints[name], name) for name, value in given.items()}
+    return run_experiment(replace(trained, output=folder, **values))

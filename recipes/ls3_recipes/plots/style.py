@@ -39,11 +39,12 @@ STYLE: Any = {
 Pictures = dict[str, Callable[[], None]]
 
 
-def draw(pictures: Pictures) -> dict[str, str]:
+def draw(pictures: Pictures, after_each: Callable[[], object] = lambda: None) -> dict[str, str]:
     """Draw pictures one by one; one that fails costs nothing but itself, and is told.
 
     Args:
         pictures: what draws them, by the names of their files.
+        after_each: called after each.
 
     Returns:
         The reasons why pictures failed, by the same names.
@@ -55,6 +56,7 @@ def draw(pictures: Pictures) -> dict[str, str]:
         except Exception as error:  # whatever it is: the results are there already
             failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
             console.print(f"{name} was not drawn: {failed[name]}", markup=False)
+        after_each()
     return failed
 
 

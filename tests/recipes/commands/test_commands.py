@@ -115,7 +115,7 @@ def test_the_gallerys_help(capsys):
         (["train", "preset=smoke", "agent.latent_dim=0"], "ls3 train: agent.latent_dim must be at least 1"),
         (["train", "preset=smoke", "buffer.success_tail=0"], "ls3 train: buffer.success_tail must be at least 1"),
         (["train", "preset=smoke", "data=nowhere"], "ls3 train: "),
-        (["evaluate", "run=nowhere"], "ls3 evaluate: nowhere is no run folder"),
+        (["evaluate", "run=nowhere"], "ls3 evaluate: nowhere holds no run"),
         (["report", "runs=nowhere"], "ls3 report: nowhere "),
         (["train", "preset=fast", "--help"], "ls3 train: preset must be one of cpu, paper, smoke; got 'fast'."),
         (["collect", "planner.horizon=9"], "ls3 collect: planner.horizon=9: ls3 collect has no planner."),

@@ -71,13 +71,13 @@ def test_an_agent_that_is_missing_is_named_with_those_that_there_are(run_folder,
     for name in ("config.yaml", "checkpoints/agent_000.pt", "checkpoints/agent_001.pt"):
         shutil.copy(run_folder / name, unfinished / name)
     said = (
-        r"agent\.pt is missing. The run is not finished: ls3 train resume=.*/run goes on with it. Its newest agent is "
+        r"agent\.pt is missing. The newest agent of the run is agent=checkpoints/agent_001.pt. It is not finished: ls3"
     )
-    with pytest.raises(FileNotFoundError, match=said + r"agent=checkpoints/agent_001.pt, of 2\."):
+    with pytest.raises(FileNotFoundError, match=said):
         evaluated(f"run={unfinished}", f"output={tmp_path / 'evaluation'}")
     assert not (tmp_path / "evaluation").exists()
     evaluated(f"run={unfinished}", "agent=checkpoints/agent_001.pt", "episodes=1", f"output={tmp_path / 'evaluation'}")
-    with pytest.raises(FileNotFoundError, match=r"agent_009\.pt is missing. Its newest agent is"):
+    with pytest.raises(FileNotFoundError, match=r"agent_009\.pt is missing. The newest agent of the run is"):
         evaluated(f"run={run_folder}", "agent=checkpoints/agent_009.pt", f"output={tmp_path / 'other'}")
 
 

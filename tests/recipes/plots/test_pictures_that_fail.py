@@ -23,6 +23,18 @@ STANDARD = ("pixels", "action", *(("next", key) for key in ("pixels", "reward", 
 QUICK = ("preset=smoke", "device=cpu", "online.updates=1", "task.horizon=6")
 
 
+def test_between_pictures_a_signal_that_waits_is_heard():
+    drawn = []
+
+    def stop():
+        if len(drawn) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        draw({name: lambda name=name: drawn.append(name) for name in "abc"}, stop)
+    assert drawn == ["a", "b"]
+
+
 def test_each_failure_is_told_and_the_others_are_drawn(tmp_path, capsys):
     def fail():
         with picture(tmp_path / "b.png", 1, 1, (1, 1)):
