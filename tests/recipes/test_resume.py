@@ -349,7 +349,7 @@ def test_a_folder_is_enough_to_rebuild_the_buffer(monkeypatch):
     documented: dict = {}
     block = re.search(r"```python\n(.*?)```", RELIABILITY.read_text(), flags=re.DOTALL)
     exec(compile(block[1], "reliability.md", "exec"), documented)
-    documented["refill"](buffer, Path("mine"))
+    documented["refill"](buffer, Path("mine/demonstrations"), Path("mine"))
     own = held[0].transitions.storage[:]
     same = [key for key in own.keys(True, True) if key not in ("loc", "scale", ("next", "loc"), ("next", "scale"))]
     assert (buffer.transitions.storage[:].select(*same) == own.select(*same)).all()
