@@ -181,7 +181,7 @@ def _metrics(folder):
 
 
 def _names(folder):
-    skip = ("tensorboard",)
+    skip = ("tensorboard", "lock")  # a lock says nothing once its process has ended
     return {
         str(path.relative_to(folder)) for path in folder.rglob("*") if path.relative_to(folder).parts[0] not in skip
     }
