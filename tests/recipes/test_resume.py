@@ -10,17 +10,16 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from ls3_recipes import resume, versions
 from ls3_recipes.algorithms import ls3
 from ls3_recipes.commands.train import main
 from ls3_recipes.configuration import settings_of_run, train_settings
 from ls3_recipes.options import as_dict
-from ls3_recipes.progress import HeldRandomState, Progress
+from ls3_recipes.progress import HeldRandomState, Progress, Worlds
 from ls3_recipes.protocol import Experiment, run_experiment
 from ls3_recipes.resume import begun_with, open_folder
-from ls3_recipes.rollout import collect_demonstrations
+from ls3_recipes.rollout import collect_demonstrations, make_env
 from ls3_recipes.run_files import read_metrics
 from ls3_recipes.run_folder import AGENTS, RunFolder
 from ls3_recipes.run_settings import decided
@@ -410,17 +409,14 @@ def test_seconds_of_the_processes_before_are_counted():
     assert 100.0 <= other.seconds["vae"] < 160.0
 
 
-def test_worlds_begin_their_next_episodes_again():
-    from ls3_recipes.progress import Worlds
-    from ls3_recipes.rollout import make_env
-
-    task = settings().task
-    one, other = (make_env(task, 2, seed, CPU) for seed in (1, 2))
+@pytest.mark.parametrize("task", ["navigation", "reacher", "pushing", "cable_routing"])
+def test_worlds_begin_their_next_episodes_again(task):
+    of_task = settings(f"task={task}").task
+    one, other = (make_env(of_task, 2, seed, CPU) for seed in (1, 2))
     one.reset()
     one.rollout(5)
     first = one.reset()
     Worlds(other).load_state_dict(Worlds(one).state_dict())
     again = other.reset()
-    assert isinstance(first, TensorDict)
     assert torch.equal(first["pixels"], again["pixels"])
     assert torch.equal(one.reset()["state"], other.reset()["state"])

@@ -25,7 +25,7 @@ def test_a_full_disk_is_named_and_the_run_goes_on_when_there_is_room(small_disk,
     counting = Run([*LS3, ALWAYS, f"output={tmp_path / 'uncut'}"], tmp_path / "log", Moment(None, None))
     assert counting.ended() == 0, counting.said()
     calls = int(counting.said().split("calls ")[-1].split()[0])
-    for number in range(10 if soak else 2):
+    for number in range(10 if soak else 1):
         folder, log = disk / "run", tmp_path / f"log{number}"
         moment = Moment(chance.randint(1, calls), functools.partial(fill, disk))
         run = Run([*LS3, ALWAYS, f"output={folder}"], log, moment)

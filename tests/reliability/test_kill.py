@@ -82,11 +82,11 @@ def moments(seed, phases, clock, saves):
 
 def test_a_run_that_was_killed_ends_in_the_same_bits(uncut, tmp_path, soak):
     hit = []
-    for seed, (kill, phase) in enumerate(moments(0, *((None, 18, 19) if soak else (3, 2, 3)))):
+    for seed, (kill, phase) in enumerate(moments(0, *((None, 18, 19) if soak else (2, 1, 2)))):
         where = killed_and_continued(uncut, tmp_path / "run", kill, phase, seed)
         hit += where
         print(f"{kill.__name__} {phase or ''}: killed in {where}, continued to the same bits")
-    assert len(hit) >= (50 if soak else 5)
+    assert len(hit) >= (50 if soak else 3)
     if soak:
         assert set(hit) >= set(PHASES)
 
@@ -96,14 +96,14 @@ def test_so_does_a_run_of_the_comparisons(tmp_path, soak, name):
     if name != "recovery" and not soak:
         pytest.skip("part of the long form")
     uncut = Uncut(tmp_path, BASELINES[name])
-    for seed, (kill, _) in enumerate([(kill_by_clock, None), (kill_in_save, None)] * (5 if soak else 1)):
+    for seed, kill in enumerate([kill_in_save, kill_by_clock] * 5 if soak else [kill_in_save]):
         killed_and_continued(uncut, tmp_path / "run", kill, None, seed)
 
 
 @pytest.mark.parametrize("task", ["reacher", "pushing", "cable_routing"])
 def test_so_does_a_run_in_mujoco(tmp_path, soak, task):
-    if task != "reacher" and not soak:
+    if not soak:
         pytest.skip("part of the long form")
     uncut = Uncut(tmp_path, [*LS3, f"task={task}"])
-    for seed, phase in enumerate(["planning", "Safe set", "evaluation"] if soak else ["planning"]):
+    for seed, phase in enumerate(["planning", "Safe set", "evaluation"]):
         killed_and_continued(uncut, tmp_path / "run", kill_by_phase, phase, seed)

@@ -34,7 +34,7 @@ def handles():
 
 @pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="the system does not tell")
 def test_online_updates_leave_memory_and_handles_as_they_were(monkeypatch, tmp_path, soak):
-    updates = 2000 if soak else 40
+    updates = 2000 if soak else 20
     seen, save = [], Experiment._keep_episodes
 
     def watched(self, update, episodes):
