@@ -17,11 +17,13 @@ from ls3_torchrl.data.labels import (
 )
 from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.selection import RowSelection
+from ls3_torchrl.data.stream import BatchStream
 from ls3_torchrl.data.tags import ALL_TAGS, VALUE_TAGS, Tag
 
 __all__ = [
     "ALL_TAGS",
     "VALUE_TAGS",
+    "BatchStream",
     "DataWarning",
     "EpisodeKeys",
     "RowSelection",

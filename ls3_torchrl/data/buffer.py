@@ -125,6 +125,7 @@ class TaggedReplayBuffer:
         self._views: dict[RowSelection, TensorDictReplayBuffer] = {}
         self._encoder: TensorDictModuleBase | None = None
         self._encoded = False
+        self._encodings = 0
         self._warned = False  # of offline data that are overwritten
 
     def __len__(self) -> int:
@@ -154,6 +155,11 @@ class TaggedReplayBuffer:
     def write_count(self) -> int:
         """Transitions written so far, overwritten ones included."""
         return self.transitions.write_count
+
+    @property
+    def version(self) -> tuple[int, int]:
+        """Another one whenever rows were written or encoded anew."""
+        return self.write_count, self._encodings
 
     def add(self, episodes: Episodes, tag: Tag | str) -> None:
         """Label and store whole episodes.
@@ -308,6 +314,7 @@ class TaggedReplayBuffer:
                 rows.get(key).copy_(posteriors[key][slot])
                 rows.get(("next", key)).copy_(posteriors[key][after])
         self._encoder, self._encoded = encoder, True
+        self._encodings += 1
 
     def _encode(
         self, encoder: TensorDictModuleBase, frames: Tensor, progress: Callable[[int, int], None] | None = None
@@ -365,8 +372,8 @@ class TaggedReplayBuffer:
             ``next``.
         """
         selection = RowSelection.of(selection, filters)
-        if not (self._encoded or observations):
-            raise RuntimeError("The buffer has no latents yet: call buffer.encode(encoder) after training the VAE.")
+        if not observations:
+            self._require_latents()
         rows = self._stretches(batch_size * (members or 1), selection)[1]
         if observations:
             for group, slot in zip((rows, rows.get("next")), self._store.slots(rows["frame"]), strict=True):
@@ -377,6 +384,33 @@ class TaggedReplayBuffer:
             group.set("latent", torch.addcmul(loc, group.get("scale"), torch.randn_like(loc)))
         steps = [] if selection.steps is None else [selection.steps]
         return rows.reshape(batch_size, *([] if members is None else [members]), *steps)
+
+    def _require_latents(self) -> None:
+        if not self._encoded:
+            raise RuntimeError("The buffer has no latents yet: call buffer.encode(encoder) after training the VAE.")
+
+    def draw(
+        self,
+        batches: int,
+        batch_size: int,
+        selection: RowSelection | None = None,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Numbers of rows for many batches at once, int64 ``[batches, batch_size]``; of stretches the first rows.
+
+        Args:
+            batches: how many.
+            batch_size: rows in each.
+            selection: which rows; all when ``None``.
+            generator: of the random numbers, on the CPU; PyTorch's own when ``None``.
+
+        Raises:
+            RuntimeError: without encoder, or without rows of the selection.
+        """
+        self._require_latents()
+        view = self.view(selection)
+        return view.sampler.draw(view.storage, batches, batch_size, generator=generator)
 
     def _stretches(self, count: int, selection: RowSelection) -> tuple[TensorDictBase, TensorDictBase]:
         """The first rows ``[count]`` of stretches of one episode each, and all of their rows ``[count * steps]``."""
@@ -500,6 +534,7 @@ class TaggedReplayBuffer:
 
     def _after_loading(self, encoded: bool) -> None:
         self._encoded = encoded
+        self._encodings += 1
         if not encoded:
             self._encoder = None  # its latents are not those of the rows
         for view in self._views.values():

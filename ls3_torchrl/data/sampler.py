@@ -93,16 +93,29 @@ class TagSampler(Sampler):
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
         """Indices ``[batch_size]``."""
+        return self.draw(storage, 1, batch_size).squeeze(0), {}
+
+    def draw(
+        self, storage: Storage, batches: int, batch_size: int, *, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Indices of many batches at once, int64 ``[batches, batch_size]``, each drawn as :meth:`sample` draws one.
+
+        Args:
+            storage: what is drawn from.
+            batches: how many.
+            batch_size: indices in each.
+            generator: of the random numbers, on the CPU; PyTorch's own when ``None``.
+        """
         rows = self.rows(storage)
         if rows.numel() == 0:
             raise RuntimeError(self._nothing(storage))
         parts = self._parts(storage)
         online = round(self.selection.online_fraction * batch_size) if len(parts) == 2 else 0
         drawn = [
-            part[torch.randint(part.numel(), (count,), device=part.device)]
+            part[torch.randint(part.numel(), (batches, count), generator=generator).to(part.device)]
             for part, count in zip(parts, (batch_size - online, online), strict=False)
         ]
-        return torch.cat(drawn), {}
+        return torch.cat(drawn, 1)
 
     def _nothing(self, storage: Storage) -> str:
         selection = self.selection

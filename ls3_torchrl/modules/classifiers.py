@@ -71,13 +71,16 @@ class LatentClassifier(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the logit, and the probability where it was asked for."""
         require_keys(tensordict, self.in_keys, type(self).__name__)
-        latent = tensordict.get(self.in_keys[0])
-        require_size(latent, self.latent_dim, self.in_keys[0], type(self).__name__)
-        logit: Tensor = self.network(latent)
+        logit = self.of_latent(tensordict.get(self.in_keys[0]))
         tensordict.set(self.out_keys[0], logit)
         if len(self.out_keys) > 1:
             tensordict.set(self.out_keys[1], logit.sigmoid())
         return tensordict
+
+    def of_latent(self, latent: Tensor) -> Tensor:
+        """Logits ``[*B, 1]`` of latents ``[*B, D]``."""
+        require_size(latent, self.latent_dim, self.in_keys[0], type(self).__name__)
+        return self.network(latent)
 
     def probability(self, latent: Tensor) -> Tensor:
         """Probabilities ``[*B, 1]`` in [0, 1] of latents ``[*B, D]``."""

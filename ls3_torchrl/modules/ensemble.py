@@ -70,9 +70,22 @@ class EnsembleMLP(nn.Module):
         else:
             batch = inputs.shape[:-1]
             hidden = inputs.reshape(1, -1, inputs.shape[-1]).expand(self.num_members, -1, -1)
-        *layers, (weight, bias) = zip(self.weights, self.biases, strict=True)
-        for hidden_weight, hidden_bias in layers:
-            hidden = torch.baddbmm(hidden_bias, hidden, hidden_weight).relu_()
-        with torch.autocast(hidden.device.type, enabled=False):
-            hidden = torch.baddbmm(bias, hidden.to(weight.dtype), weight)
-        return hidden.transpose(0, 1).reshape(*batch, self.num_members, weight.shape[-1])
+        output = run_stacked(hidden, list(zip(self.weights, self.biases, strict=True)))
+        return output.transpose(0, 1).reshape(*batch, self.num_members, output.shape[-1])
+
+
+def run_stacked(inputs: Tensor, layers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    """Outputs ``[M, R, out]`` of M ReLU networks for rows ``[M, R, in]``; under autocast the last layer stays in fp32.
+
+    Args:
+        inputs: what each network sees.
+        layers: weights ``[M, in, out]`` and biases ``[M, 1, out]``.
+    """
+    *hidden_layers, (weight, bias) = layers
+    hidden = inputs
+    for hidden_weight, hidden_bias in hidden_layers:
+        hidden = torch.baddbmm(hidden_bias, hidden, hidden_weight).relu_()
+    if not torch.is_autocast_enabled(hidden.device.type):
+        return torch.baddbmm(bias, hidden, weight)
+    with torch.autocast(hidden.device.type, enabled=False):
+        return torch.baddbmm(bias, hidden.to(weight.dtype), weight)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from ls3_torchrl._checks import require_keys, require_size
 from ls3_torchrl.modules.ensemble import EnsembleMLP
@@ -59,6 +60,9 @@ class ValueEnsemble(TensorDictModuleBase):
         """Write every member's value of the latent."""
         require_keys(tensordict, self.in_keys, "ValueEnsemble")
         latent = tensordict.get(self.in_keys[0])
+        return tensordict.set(self.out_keys[0], self.of_latent(latent, per_member=per_member))
+
+    def of_latent(self, latent: Tensor, *, per_member: bool = False) -> Tensor:
+        """Every member's value ``[*B, M, 1]`` of latents ``[*B, D]``, or ``[*B, M, D]`` with ``per_member``."""
         require_size(latent, self.latent_dim, self.in_keys[0], "ValueEnsemble")
-        value = self.network(latent, per_member=per_member)
-        return tensordict.set(self.out_keys[0], value)
+        return self.network(latent, per_member=per_member)

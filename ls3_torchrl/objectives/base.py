@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from ls3_torchrl._checks import require_keys
+from ls3_torchrl.modules.call import Weights
 
 
 class LatentLoss(LossModule):
@@ -56,9 +57,33 @@ class LatentLoss(LossModule):
     #: Accepted keys that a module writes, which no batch needs to hold.
     _written: frozenset[str] = frozenset()
 
+    def _weights(self, name: str) -> Weights:
+        """The weights ``{name}_params`` of a network that was made functional, found once."""
+        found: dict[str, Weights] = self.__dict__.setdefault("_found_weights", {})
+        if name not in found:
+            network = getattr(self, name.removeprefix("target_"))
+            found[name] = Weights(network, getattr(self, f"{name}_params"))
+        return found[name]
+
+    def _apply(self, *args: Any, **kwargs: Any) -> Self:
+        self.__dict__.pop("_found_weights", None)  # moved or cast, they may be other tensors
+        return super()._apply(*args, **kwargs)
+
+    def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
+        """As for any module."""
+        self.__dict__.pop("_found_weights", None)
+        return super().load_state_dict(*args, **kwargs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_found_weights"}
+
+    #: Whether ``forward`` is that of this class.
+    _has_plain_forward = True
+
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         cls.default_keys = cls._AcceptedKeys
+        cls._has_plain_forward = cls._has_plain_forward and "forward" not in vars(cls)  # before TorchRL has wrapped it
 
     def _start_from_keys(self, **defaults: NestedKey) -> None:
         """Take other default keys than the class has, such as those of the modules that the loss is made for."""
@@ -90,6 +115,11 @@ class LatentLoss(LossModule):
     def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """What the loss returns, by name."""
         raise NotImplementedError
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether a call does nothing but compute :meth:`losses`: no hooks, no other ``forward``."""
+        return not (self._forward_hooks or "forward" in vars(self)) and self._has_plain_forward
 
 
 def with_members(target: Tensor, predicted: Tensor, who: str, *, trailing: int = 1) -> Tensor:

@@ -10,12 +10,12 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ls3_torchrl._checks import require_labels
-from ls3_torchrl.modules.call import call_on_latent
 from ls3_torchrl.modules.classifiers import LatentClassifier, SafeSet
-from ls3_torchrl.objectives.base import LatentLoss, require_shape_of
+from ls3_torchrl.objectives.base import require_shape_of
+from ls3_torchrl.objectives.head import HeadLoss
 
 
-class ClassifierLoss(LatentLoss):
+class ClassifierLoss(HeadLoss):
     """Binary cross-entropy of a latent classifier to a label of the state that was reached.
 
     A :class:`~ls3_torchrl.modules.LatentClassifier` knows its name and its label. For any other module the label of
@@ -54,6 +54,7 @@ class ClassifierLoss(LatentLoss):
         latent: NestedKey = ("next", "latent")
         label: NestedKey = ("next", "constraint")
 
+    head = "classifier"
     classifier: TensorDictModuleBase
 
     def __init__(self, classifier: TensorDictModuleBase, *, name: str | None = None) -> None:
@@ -73,11 +74,10 @@ class ClassifierLoss(LatentLoss):
             label = ("next", "success" if self.name == "goal" else self.name)
         self._start_from_keys(label=label)
 
-    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """Cross-entropy and accuracy on states ``[B]``."""
+    def losses_of(self, logit: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """Cross-entropy and accuracy of logits ``[B, 1]`` on states ``[B]``."""
         keys = self.tensor_keys
         label = tensordict.get(keys.label)
-        logit = call_on_latent(self.classifier, tensordict.get(keys.latent))
         require_shape_of(label, logit, keys.label, f"ClassifierLoss of {self.name!r}")
         require_labels(label, keys.label)
         hits = ((logit.detach() > 0) == label.bool()).float()

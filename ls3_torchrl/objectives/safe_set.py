@@ -12,10 +12,11 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ls3_torchrl._checks import require_labels, require_unit_interval
 from ls3_torchrl.modules.call import call_on_latent
-from ls3_torchrl.objectives.base import LatentLoss, require_shape_of
+from ls3_torchrl.objectives.base import require_shape_of
+from ls3_torchrl.objectives.head import HeadLoss
 
 
-class SafeSetLoss(LatentLoss):
+class SafeSetLoss(HeadLoss):
     """Binary cross-entropy of f_S(z_t) to max(1_S(z_t), γ_S f_S'(z_{t+1})) (equation (5)).
 
     Rows may carry a weight under ``weight``; those of a trajectory that neither succeeded nor violated, say, tell
@@ -66,6 +67,7 @@ class SafeSetLoss(LatentLoss):
 
     _optional = frozenset({"weight"})
 
+    head = "safe_set"
     safe_set: TensorDictModuleBase
     safe_set_params: TensorDictParams
     target_safe_set_params: TensorDictParams
@@ -79,17 +81,16 @@ class SafeSetLoss(LatentLoss):
     def target(self, next_latent: Tensor, in_success: Tensor) -> Tensor:
         """max(1_S(z_t), γ_S f_S'(z_{t+1})), a probability ``[B, 1]``."""
         with torch.no_grad():
-            next_safe = call_on_latent(self.safe_set, next_latent, params=self.target_safe_set_params).sigmoid()
+            next_safe = call_on_latent(self.safe_set, next_latent, params=self._weights("target_safe_set")).sigmoid()
         require_shape_of(in_success, next_safe, self.tensor_keys.in_success, "SafeSetLoss")
         require_labels(in_success, self.tensor_keys.in_success)
         return torch.maximum(in_success.to(next_safe), self.gamma * next_safe)
 
-    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """The loss on transitions ``[B]``."""
+    def losses_of(self, logit: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """The loss of logits ``[B, 1]`` on transitions ``[B]``."""
         keys = self.tensor_keys
         target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.in_success))
         weight = tensordict.get(keys.weight, None)
-        logit = call_on_latent(self.safe_set, tensordict.get(keys.latent), params=self.safe_set_params)
         if weight is not None:
             require_shape_of(weight, logit, keys.weight, "SafeSetLoss")
             if not torch.compiler.is_compiling() and (weight < 0).any():

@@ -155,14 +155,14 @@ class TD1ValueLoss(LatentLoss):
         self.bootstrap = bootstrap
         self._optional = frozenset() if monte_carlo else frozenset({"reward_to_go"})
 
-    def _values(self, latent: Tensor, params: TensorDictParams) -> Tensor:
+    def _values(self, latent: Tensor, which: str) -> Tensor:
         options = {"per_member": True} if self.bootstrap else {}
-        return call_on_latent(self.value, latent, params=params, **options)
+        return call_on_latent(self.value, latent, params=self._weights(which), **options)
 
     def target(self, next_latent: Tensor, reward: Tensor) -> Tensor:
         """r_t + γ V_θ'(z_{t+1}), ``[B, 1]``, or ``[B, M, 1]`` of every member."""
         with torch.no_grad():
-            next_value = self._values(next_latent, self.target_value_params)
+            next_value = self._values(next_latent, "target_value")
         reward = with_members(reward, next_value, "TD1ValueLoss").expand_as(next_value)
         never = torch.zeros_like(reward, dtype=torch.bool)
         target = td0_return_estimate(self.gamma, next_value, reward, terminated=never)
@@ -177,5 +177,5 @@ class TD1ValueLoss(LatentLoss):
         target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.reward))
         if self.monte_carlo:
             target = torch.maximum(target, with_members(tensordict.get(keys.reward_to_go), target, "TD1ValueLoss"))
-        value = self._values(latent, self.value_params)
+        value = self._values(latent, "value")
         return {"loss_value": (value - target).square().mean()}

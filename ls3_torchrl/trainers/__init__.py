@@ -2,7 +2,8 @@
 
 from ls3_torchrl.trainers.checkpoints import Checkpoints, Stateful
 from ls3_torchrl.trainers.diagnostics import StateProbe
-from ls3_torchrl.trainers.learner import AuxiliaryLoss, DivergenceError, Learner, LearnerGroup, Stage
+from ls3_torchrl.trainers.group import LearnerGroup, Stage
+from ls3_torchrl.trainers.learner import AuxiliaryLoss, DivergenceError, Learner
 from ls3_torchrl.trainers.ls3 import LS3Trainer
 from ls3_torchrl.trainers.options import (
     LossOptions,

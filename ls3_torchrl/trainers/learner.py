@@ -5,18 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import Parameter
+from torch.nn.modules.dropout import _DropoutNd
+from torch.nn.utils import get_total_norm
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.record.loggers import Logger
 
+from ls3_torchrl.data import BatchStream
 from ls3_torchrl.layers import fastest_precision
+from ls3_torchrl.objectives.base import LatentLoss
 from ls3_torchrl.trainers.options import Autocast
-from ls3_torchrl.trainers.progress import progress_bar
+from ls3_torchrl.trainers.progress import Bar, progress_bar
 
 #: Gradient steps between logged metrics.
 LOG_INTERVAL = 100
@@ -80,19 +84,36 @@ class DivergenceError(FloatingPointError):
         return type(self), (self.phase, self.step, self.scalars, self.batch, self.remedy)
 
 
+def new_seed(generator: torch.Generator | None = None) -> int:
+    """A seed from a random stream, PyTorch's own when ``None``."""
+    return int(torch.randint(2**63 - 1, (), generator=generator))
+
+
 def descend(optimizer: torch.optim.Optimizer, parameters: Iterable[Parameter], value: Tensor) -> bool:
     """One gradient step down ``value``; none, and ``False``, when it, its gradient or the square of that is not finite.
 
     Adam's average of squares would stay infinite for ever, and what it belongs to would never move again.
     """
-    optimizer.zero_grad()
-    value.backward()
-    # NaN and infinity outlast norms, which are cheaper than a look at every entry.
-    norms = [torch.linalg.vector_norm(parameter.grad) for parameter in parameters if parameter.grad is not None]
-    if not torch.isfinite(torch.stack([value.detach(), *norms]).sum()):
+    if not set_gradients(parameters, value):
         return False
     optimizer.step()
     return True
+
+
+def set_gradients(parameters: Iterable[Parameter], value: Tensor) -> bool:
+    """Compute the gradients of ``value``; whether it and the square of its gradient are finite."""
+    parameters = list(parameters)
+    for parameter in parameters:
+        parameter.grad = None
+    value.backward()
+    return is_finite(parameters, value)
+
+
+def is_finite(parameters: Iterable[Parameter], value: Tensor) -> bool:
+    """Whether a loss and the square of its gradient are finite."""
+    # NaN and infinity outlast a norm, which is cheaper than a look at every entry.
+    norm = get_total_norm([parameter.grad for parameter in parameters if parameter.grad is not None])
+    return bool(torch.isfinite(value.detach() + norm))
 
 
 class AuxiliaryLoss(NamedTuple):
@@ -115,7 +136,8 @@ class Learner:
     Args:
         names: the losses ``loss_{name}`` are minimised, in one step if there are several.
         loss: a TorchRL loss module.
-        sample: draws a batch.
+        sample: draws a batch. With a :class:`~ls3_torchrl.data.BatchStream` here and in ``auxiliary``, every phase has
+            a random stream of its own, and a :class:`LearnerGroup` may train it beside others.
         lr: Adam's learning rate.
         target_interval: gradient steps between copies to the target network; ``None`` without one.
         tau: fraction of the way that the target network moves at every step instead.
@@ -174,18 +196,52 @@ class Learner:
         self._phase: tuple[int, str] | None = None  # that phase
         self._batch: TensorDictBase | None = None  # the last one
 
-    def compute_loss(self) -> tuple[TensorDictBase, Tensor]:
+    @property
+    def streams(self) -> list[BatchStream]:
+        """Where its batches come from, as far as these have random streams of their own."""
+        sources = [self.sample, *([] if self.auxiliary is None else [self.auxiliary.sample])]
+        return [source for source in sources if isinstance(source, BatchStream)]
+
+    @property
+    def is_independent(self) -> bool:
+        """Whether all its random numbers are its own: batches from streams, and no dropout in its networks."""
+        drops = any(isinstance(module, _DropoutNd) for loss in self.losses for module in loss.modules())
+        return len(self.streams) == len(self.losses) and not drops
+
+    @property
+    def phase_steps(self) -> int:
+        """Steps that were taken of the phase that it is in."""
+        return self._phase_steps
+
+    @property
+    def losses(self) -> list[LossModule]:
+        """All of its losses."""
+        return [self.loss, *([] if self.auxiliary is None else [self.auxiliary.loss])]
+
+    def compute_loss(self) -> tuple[dict[str, Tensor], Tensor]:
         """What the losses write for a new batch, and the sum that is minimised."""
-        rows = self._batch = self._as_parameters(self.sample())
+        rows = self.new_batch()
         second = None if self.auxiliary is None else self._as_parameters(self.auxiliary.sample())
-        with torch.autocast(self.parameters[0].device.type, torch.bfloat16, enabled=self.bf16):
-            losses = self.loss(rows)
-            value = torch.stack([losses[f"loss_{name}"] for name in self.names]).sum()
+        with self.autocast():
+            losses = _values_of(self.loss, rows)
+            value = losses[f"loss_{self.names[0]}"]
+            for name in self.names[1:]:
+                value = value + losses[f"loss_{name}"]
             if self.auxiliary is not None:
-                auxiliary = self.auxiliary.loss(second)[f"loss_{self.names[0]}"]
+                assert second is not None
+                auxiliary = _values_of(self.auxiliary.loss, second)[f"loss_{self.names[0]}"]
                 losses["auxiliary"] = auxiliary.detach()
                 value = value + self.auxiliary.weight * auxiliary
         return losses, value
+
+    def new_batch(self) -> TensorDictBase:
+        """The next batch, where the parameters are."""
+        self._batch = self._as_parameters(self.sample())
+        return self._batch
+
+    def autocast(self) -> torch.autocast:
+        """In which its losses are computed."""
+        return torch.autocast(self.parameters[0].device.type, torch.bfloat16, enabled=self.bf16)
 
     def _as_parameters(self, rows: TensorDictBase) -> TensorDictBase:
         """A batch where the parameters are, in their precision."""
@@ -196,11 +252,16 @@ class Learner:
             rows = rows.apply(lambda entry: entry.to(dtype) if entry.is_floating_point() else entry)
         return rows
 
-    def train(self, steps: int, phase: str) -> None:
+    def train(self, steps: int, phase: str, *, seed: int | None = None) -> None:
         """Take ``steps`` gradient steps, which are logged and shown as ``phase``; none where nothing can be trained.
 
         After :meth:`load_state_dict` of a state from the middle of a phase, or where ``after_step`` ended it, those
         that are left of it.
+
+        Args:
+            steps: in all.
+            phase: its name.
+            seed: of the phase's random streams; drawn from PyTorch's own stream when ``None``.
 
         Raises:
             DivergenceError: when a loss or a gradient is not finite.
@@ -208,28 +269,64 @@ class Learner:
         """
         if self.optimizer is None:
             return
+        with progress_bar(steps, phase, done=self.steps_done(steps, phase), enabled=self.progress) as bar:
+            self.take_steps(steps, phase, bar, seed=seed, after_step=self.after_step)
+
+    def steps_done(self, steps: int, phase: str) -> int:
+        """Steps of a phase that were taken already.
+
+        Raises:
+            RuntimeError: for another phase than the one that was begun.
+        """
         if self._phase not in (None, (steps, phase)):
             raise RuntimeError(
                 f"{self._phase_steps} steps of {self._phase} were taken; now {(steps, phase)} is asked for. Call what "
                 "was called then, which takes the steps that are left."
             )
+        return self._phase_steps
+
+    def take_steps(
+        self,
+        steps: int,
+        phase: str,
+        bar: Bar,
+        *,
+        seed: int | None = None,
+        after_step: Callable[[], object] | None = None,
+    ) -> None:
+        """What :meth:`train` does, shown on a bar that others may share.
+
+        Args:
+            steps: in all.
+            phase: its name.
+            bar: advances with every step.
+            seed: as in :meth:`train`.
+            after_step: called after every step.
+        """
+        if self.optimizer is None:
+            bar.update(steps)
+            return
+        self.begin(steps, phase, seed)
+        # Networks of this size lose more by waking a second core than they gain by it.
+        with threads(1):
+            while self.phase_steps < steps:
+                losses, value = self.compute_loss()
+                if not set_gradients(self.parameters, value):
+                    raise self.divergence(losses)
+                self.step(losses, value, bar)
+                if after_step is not None:
+                    after_step()
+        self.end()
+
+    def begin(self, steps: int, phase: str, seed: int | None) -> None:
+        """Begin a phase, unless it was begun before."""
+        if self._phase is None and self.streams:
+            own = torch.Generator().manual_seed(new_seed() if seed is None else seed)
+            for stream in self.streams:
+                stream.seed(new_seed(own))
         self._phase = (steps, phase)
         self._require_one_precision()
         self._make_target()
-        # Networks of this size lose more by waking a second core than they gain by it.
-        with threads(1), progress_bar(steps, phase, done=self._phase_steps, enabled=self.progress) as bar:
-            while self._phase_steps < steps:
-                for group in self.optimizer.param_groups:
-                    group["lr"] = self.lr * cooled_down(self._phase_steps / steps, self.cooldown)
-                losses, value = self._step(phase)
-                if self._phase_steps % LOG_INTERVAL == 0 or self._phase_steps == steps - 1:
-                    log_scalars(self.logger, phase, self.steps, self._scalars(losses))
-                    bar.set_postfix_str(f"loss {value.item():.4g}", refresh=False)
-                bar.update()
-                self._phase_steps += 1
-                if self.after_step is not None:
-                    self.after_step()
-        self._phase_steps, self._phase = 0, None
 
     def _require_one_precision(self) -> None:
         kinds = {
@@ -258,17 +355,33 @@ class Learner:
             # It copies again at calls k + 1, 2(k + 1), …, so k is one less than the interval that is meant.
             self.target = HardUpdate(self.loss, value_network_update_interval=self.target_interval - 1)
 
-    def _step(self, phase: str) -> tuple[TensorDictBase, Tensor]:
+    def step(self, losses: Mapping[str, Tensor], value: Tensor, bar: Bar) -> None:
+        """Take a step along the gradients that there are, log it and show it."""
         assert self.optimizer is not None
-        losses, value = self.compute_loss()
-        if not descend(self.optimizer, self.parameters, value):
-            raise DivergenceError(phase, self.steps, self._scalars(losses), self._batch, "Lower its learning rate.")
+        assert self._phase is not None
+        steps, phase = self._phase
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.lr * cooled_down(self._phase_steps / steps, self.cooldown)
+        self.optimizer.step()
         if self.target is not None:
             self.target.step()
         self.steps += 1
-        return losses, value
+        if self._phase_steps % LOG_INTERVAL == 0 or self._phase_steps == steps - 1:
+            log_scalars(self.logger, phase, self.steps, self._scalars(losses))
+            bar.set_postfix_str(f"loss {value.item():.4g}", refresh=False)
+        bar.update()
+        self._phase_steps += 1
 
-    def _scalars(self, losses: TensorDictBase) -> dict[str, float]:
+    def end(self) -> None:
+        """End a phase."""
+        self._phase_steps, self._phase = 0, None
+
+    def divergence(self, losses: Mapping[str, Tensor]) -> DivergenceError:
+        """The error that the step which is not taken ends with."""
+        phase = self.names[0] if self._phase is None else self._phase[1]
+        return DivergenceError(phase, self.steps, self._scalars(losses), self._batch, "Lower its learning rate.")
+
+    def _scalars(self, losses: Mapping[str, Tensor]) -> dict[str, float]:
         return {key: item.item() for key, item in losses.items() if self._is_metric(key, item)}
 
     def _is_metric(self, key: str, item: Tensor) -> bool:
@@ -285,6 +398,7 @@ class Learner:
             "phase": self._phase,
             "has_target": self.target is not None,
             "target_counter": getattr(self.target, "counter", 0),
+            "streams": [stream.state_dict() for stream in self.streams],
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -299,61 +413,10 @@ class Learner:
             self.optimizer.load_state_dict(state_dict["optimizer"])
         self.steps, self._phase_steps = state_dict["steps"], state_dict["phase_steps"]
         self._phase = state_dict["phase"]
+        for stream, state in zip(self.streams, state_dict["streams"], strict=True):
+            stream.load_state_dict(state)
 
 
-#: A learner's name, its gradient steps, and what they are shown as.
-Stage: TypeAlias = tuple[str, int, str]
-
-
-class LearnerGroup:
-    """Learners that are trained one after another, and continue where a state of them was taken.
-
-    Args:
-        learners: by name.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> from ls3_torchrl.modules import GoalEstimator
-        >>> from ls3_torchrl.objectives import ClassifierLoss
-        >>> reached = {"latent": torch.zeros(4, 8), "success": torch.ones(4, 1, dtype=torch.bool)}
-        >>> batch = TensorDict({"next": reached}, [4])
-        >>> goal = Learner("goal", ClassifierLoss(GoalEstimator(8)), lambda: batch, lr=1e-3, progress=False)
-        >>> group = LearnerGroup({"goal": goal})
-        >>> group.train([("goal", 3, "Goal"), ("goal", 2, "Goal again")])
-        >>> goal.steps
-        5
-    """
-
-    def __init__(self, learners: Mapping[str, Learner]) -> None:
-        self.learners = dict(learners)
-        self._stages: list[Stage] = []  # the list that train() is in
-        self._finished = 0  # of them
-
-    def train(self, stages: Iterable[Stage]) -> None:
-        """Train by a list of stages; after :meth:`load_state_dict`, what is left of the list that was being trained.
-
-        Raises:
-            RuntimeError: for another list than the one that was being trained.
-        """
-        wanted = list(stages)
-        if self._stages and wanted != self._stages:
-            raise RuntimeError(
-                f"The state was taken in the middle of other training, in stage {self._finished + 1} of "
-                f"{self._stages}; now {wanted} is asked for. Call first what was being called then."
-            )
-        self._stages = wanted
-        for name, steps, phase in wanted[self._finished :]:
-            self.learners[name].train(steps, phase)
-            self._finished += 1
-        self._stages, self._finished = [], 0
-
-    def state_dict(self) -> dict[str, Any]:
-        """That of every learner, and how far the list of stages was carried out."""
-        learners = {name: learner.state_dict() for name, learner in self.learners.items()}
-        return {"stages": list(self._stages), "finished": self._finished} | learners
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue where :meth:`state_dict` was taken."""
-        self._stages, self._finished = list(state_dict["stages"]), state_dict["finished"]
-        for name, learner in self.learners.items():
-            learner.load_state_dict(state_dict[name])
+def _values_of(loss: LossModule, rows: TensorDictBase) -> dict[str, Tensor]:
+    """What a loss writes; of the library's own without the work on dictionaries around it."""
+    return loss.losses(rows) if isinstance(loss, LatentLoss) and loss.is_plain else dict(loss(rows).items())

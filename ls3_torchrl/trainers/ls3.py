@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import torch
@@ -12,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.record.loggers import Logger
 
 from ls3_torchrl.agent import LS3Agent
-from ls3_torchrl.data import VALUE_TAGS, RowSelection, Tag, TaggedReplayBuffer
+from ls3_torchrl.data import VALUE_TAGS, BatchStream, RowSelection, Tag, TaggedReplayBuffer
 from ls3_torchrl.objectives import (
     ClassifierLoss,
     EnsembleDynamicsLoss,
@@ -20,8 +19,10 @@ from ls3_torchrl.objectives import (
     SafeSetLoss,
     TD1ValueLoss,
 )
+from ls3_torchrl.objectives.base import LatentLoss
 from ls3_torchrl.trainers.checks import require_actions_of, warn_of_missing_outcomes
-from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner, LearnerGroup, Stage, wants_bf16
+from ls3_torchrl.trainers.group import LearnerGroup, Stage
+from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner, wants_bf16
 from ls3_torchrl.trainers.options import LS3Options
 
 #: The learners in the order in which they are trained.
@@ -98,7 +99,6 @@ class LS3Trainer:
             "progress": progress,
             "after_step": after_step,
         }
-        self._everything = RowSelection(online_fraction=options.online.fraction)
         self.dynamics = self._dynamics_learner()
         self.value, self.value_td = self._value_learner(), self._value_td_learner()
         self.safe_set = self._safe_set_learner()
@@ -118,14 +118,10 @@ class LS3Trainer:
         """Members of an ensemble that each learn from a batch of their own; ``None`` where all learn from the same."""
         return getattr(module, "num_members", None) if self.options.optim.bootstrap else None
 
-    def _sampler(self, members: int | None = None, **rows: Any) -> Callable[[], TensorDictBase]:
-        """Draws batches from the ``rows`` that a :class:`~ls3_torchrl.data.RowSelection` describes."""
+    def _batches(self, loss: LatentLoss, members: int | None = None, **rows: Any) -> BatchStream:
+        """Batches for a loss, from the ``rows`` that a :class:`~ls3_torchrl.data.RowSelection` describes."""
         selection = RowSelection(online_fraction=self.options.online.fraction, **rows)
-        # Of bound methods: a copy of the trainer draws from its own buffer, and can be pickled.
-        return partial(self._sample, selection, members)
-
-    def _sample(self, selection: RowSelection, members: int | None) -> TensorDictBase:
-        return self.buffer.sample(self.options.optim.batch_size, selection, members=members)
+        return BatchStream(self.buffer, self.options.optim.batch_size, selection, reads=loss, members=members)
 
     def _dynamics_learner(self) -> Learner:
         """Equation (2)."""
@@ -135,8 +131,8 @@ class LS3Trainer:
         loss = EnsembleDynamicsLoss(dynamics, bootstrap=members is not None, steps=horizon)
         loss.set_keys(action=self.buffer.keys.action)
         without = None if self.buffer.dynamics_after_violation else "after_violation"
-        sample = self._sampler(members, without=without, steps=horizon if horizon > 1 else None)
-        return Learner("dynamics", loss, sample, lr=options.optim.dynamics_lr, **self._how)
+        batches = self._batches(loss, members, without=without, steps=horizon if horizon > 1 else None)
+        return Learner("dynamics", loss, batches, lr=options.optim.dynamics_lr, **self._how)
 
     def _value_learner(self) -> Learner:
         """Equation (3), and the value of failure where it is asked for."""
@@ -145,12 +141,11 @@ class LS3Trainer:
         bootstrap = members is not None
         auxiliary = None
         if options.loss.failure_weight > 0.0:
-            auxiliary = AuxiliaryLoss(
-                options.loss.failure_weight, OfflineValueLoss(value, bootstrap=bootstrap), self._sample_failures
-            )
+            term = OfflineValueLoss(value, bootstrap=bootstrap)
+            auxiliary = AuxiliaryLoss(options.loss.failure_weight, term, self._failures(term, members))
         loss = OfflineValueLoss(value, bootstrap=bootstrap)
-        sample = self._sampler(members, tags=VALUE_TAGS)
-        return Learner("value", loss, sample, lr=options.optim.lr, auxiliary=auxiliary, **self._how)
+        batches = self._batches(loss, members, tags=VALUE_TAGS)
+        return Learner("value", loss, batches, lr=options.optim.lr, auxiliary=auxiliary, **self._how)
 
     def _value_td_learner(self) -> Learner:
         """Equation (4)."""
@@ -164,18 +159,21 @@ class LS3Trainer:
             bootstrap=members is not None,
         )
         loss.set_keys(reward=self.buffer.keys.reward)
-        sample = self._sampler(members, tags=VALUE_TAGS)
+        batches = self._batches(loss, members, tags=VALUE_TAGS)
         interval = options.optim.target_interval
-        return Learner("value", loss, sample, lr=options.optim.lr, target_interval=interval, **self._how)
+        return Learner("value", loss, batches, lr=options.optim.lr, target_interval=interval, **self._how)
 
     def _safe_set_learner(self) -> Learner:
         """Equation (5)."""
         options = self.options
         loss = SafeSetLoss(self.agent.safe_set, gamma=options.loss.gamma_safe_set)
+        batches = self._batches(loss)
+        if options.loss.timed_out_weight != 1.0:
+            batches.extra_keys, batches.change = ("timed_out", "tag"), self._weigh
         return Learner(
             "safe_set",
             loss,
-            self._sample_weighed,
+            batches,
             lr=options.optim.lr,
             target_interval=options.optim.target_interval,
             **self._how,
@@ -184,7 +182,7 @@ class LS3Trainer:
     def _classifier_learner(self, name: str, label: NestedKey) -> Learner:
         loss = ClassifierLoss(getattr(self.agent, name), name=name)
         loss.set_keys(label=label)  # under the buffer's keys, which need not be the classifier's
-        return Learner(name, loss, self._sampler(), lr=self.options.optim.lr, **self._how)
+        return Learner(name, loss, self._batches(loss), lr=self.options.optim.lr, **self._how)
 
     def _make_failure_value(self) -> float:
         """What failing for a whole episode returns, −(1 − γ^T) / (1 − γ), unless another value was asked for."""
@@ -194,31 +192,35 @@ class LS3Trainer:
         steps = self.episode_length or int(self.buffer.transitions.storage[:]["steps_left"].max())
         return -(1.0 - gamma**steps) / (1.0 - gamma) if gamma < 1.0 else -float(steps)
 
-    def _sample_failures(self) -> TensorDictBase:
+    def _failures(self, loss: LatentLoss, members: int | None) -> BatchStream:
         """States of the violating demonstrations, labelled with the value of failure."""
-        optim = self.options.optim
-        members = self._members(self.agent.value)
-        count = max(optim.batch_size // 4, 1) * (members or 1)
-        rows = self.buffer.sample(count, tags=[Tag.CONSTRAINT])
+        return BatchStream(
+            self.buffer,
+            max(self.options.optim.batch_size // 4, 1),
+            RowSelection(tags=[Tag.CONSTRAINT]),
+            reads=loss,
+            extra_keys=[self.buffer.keys.constraint, ("next", "latent")],
+            members=members,
+            change=self._label_failures,
+        )
+
+    def _label_failures(self, rows: TensorDictBase) -> TensorDictBase:
         if self.options.loss.failure_rows == "violating":
+            shape, rows = rows.shape, rows.flatten()
             found = rows[self.buffer.keys.constraint].flatten().nonzero().flatten()
             if len(found):
                 # Those that were found stand in for the others: the batch keeps its size.
-                rows = rows[found[torch.arange(count, device=found.device) % len(found)]]
+                rows = rows[found[torch.arange(len(rows), device=found.device) % len(found)]]
                 rows.set("latent", rows["next", "latent"])
-        rows = rows if members is None else rows.reshape(-1, members)
+            rows = rows.reshape(shape)
         if self._failure_value is None:
             self._failure_value = self._make_failure_value()
         return rows.set("reward_to_go", torch.full_like(rows["reward_to_go"], self._failure_value))
 
-    def _sample_weighed(self) -> TensorDictBase:
-        """Rows for equation (5); how much online episodes that timed out count is an option."""
-        rows = self._sample(self._everything, None)
-        weight = self.options.loss.timed_out_weight
-        if weight != 1.0:
-            timed_out = rows["timed_out"] & (rows["tag"] == int(Tag.ONLINE))
-            rows.set("safe_set_weight", torch.where(timed_out, weight, 1.0))
-        return rows
+    def _weigh(self, rows: TensorDictBase) -> TensorDictBase:
+        """Rows for equation (5): how much online episodes that timed out count is an option."""
+        timed_out = rows["timed_out"] & (rows["tag"] == int(Tag.ONLINE))
+        return rows.set("safe_set_weight", torch.where(timed_out, self.options.loss.timed_out_weight, 1.0))
 
     def train_offline(self) -> None:
         """Train the latent models on the offline data (equations (2), (3), (4), (5) and the classifiers).

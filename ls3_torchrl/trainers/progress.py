@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 import sys
+from typing import Protocol
 
 from tqdm import tqdm
 
 _FORMAT = "{desc} {percentage:3.0f}%|{bar:24}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
+
+
+class Bar(Protocol):
+    """What shows how far something has come, such as a bar of tqdm."""
+
+    def update(self, n: int = 1) -> object:
+        """``n`` more steps were taken."""
+
+    def set_postfix_str(self, s: str, refresh: bool = True) -> object:
+        """Say something behind the bar."""
 
 
 def progress_bar(total: int, description: str, *, unit: str = "step", done: int = 0, enabled: bool = True) -> tqdm:

@@ -39,14 +39,14 @@ def filled(episode):
 def test_each_learner_draws_from_the_data_that_the_paper_names(make_agent):
     agent, buffer, drawn = make_agent(), TaggedReplayBuffer(100, latent_dim=8), {}
 
-    def sample(batch_size, selection, *, members=None):
+    def draw(batches, rows, selection, *, generator):
         assert selection.without is None
         assert selection.steps is None
         assert selection.online_fraction == 0.25
-        drawn[current] = ({tag.name.lower() for tag in selection.tags}, members)
+        drawn[current] = ({tag.name.lower() for tag in selection.tags}, rows // OPTIM.batch_size)
         raise KeyboardInterrupt
 
-    buffer.sample = sample
+    buffer.draw = draw
     trainer = trainer_of(agent, buffer, online=OnlineOptions(fraction=0.25))
     for current in LEARNERS:
         with pytest.raises(KeyboardInterrupt):
@@ -56,9 +56,9 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(make_agent):
         "dynamics": (everything, agent.dynamics.num_members),
         "value": ({"success", "online"}, agent.value.num_members),
         "value_td": ({"success", "online"}, agent.value.num_members),
-        "safe_set": (everything, None),
-        "constraint": (everything, None),
-        "goal": (everything, None),
+        "safe_set": (everything, 1),
+        "constraint": (everything, 1),
+        "goal": (everything, 1),
     }
 
 
@@ -88,6 +88,7 @@ def test_episodes_that_timed_out_count_as_the_option_says_online_alone(make_agen
     trainer = trainer_of(
         agent, buffer, loss=LossOptions(timed_out_weight=0.25), optim=OptimOptions(batch_size=400, autocast=False)
     )
+    trainer.safe_set.sample.extra_keys += ("frame", ("next", "success"), ("next", "constraint"))
     rows = trainer.safe_set.sample()
     weight = rows["safe_set_weight"].flatten()
     light = weight == 0.25
@@ -103,6 +104,7 @@ def test_failures_are_violating_demonstrations_at_the_value_of_failure(make_agen
     agent = make_agent()
     buffer = filled(agent)
     trainer = trainer_of(agent, buffer, loss=LossOptions(failure_weight=0.5, failure_value=-42.0))
+    trainer.value.auxiliary.sample.extra_keys += ("tag",)
     rows = trainer.value.auxiliary.sample()
     assert (rows["tag"] == int(Tag.CONSTRAINT)).all()
     assert (rows["reward_to_go"] == -42.0).all()
@@ -195,7 +197,7 @@ def test_training_that_continues_from_its_state_ends_as_one_that_was_never_stopp
         assert all(torch.equal(a, b) for a, b in pairs), name
 
 
-@pytest.mark.parametrize("stop", [2, 4, 8, 17, 19, 20, 23, 33])
+@pytest.mark.parametrize("stop", [2, 4, 8, 11, 12, 13, 17, 21])
 def test_training_that_was_stopped_in_any_phase_is_taken_up_at_that_step(make_agent, filled, stop):
     options = LS3Options(OfflineOptions(3, 3, 3, 3), OnlineOptions(3, 3, 3), OptimOptions(16, target_interval=2))
     torch.manual_seed(5)
@@ -224,7 +226,7 @@ def test_training_that_was_stopped_in_any_phase_is_taken_up_at_that_step(make_ag
     assert len(calls) == stop
     second.load_state_dict(kept["state"])
     torch.set_rng_state(kept["draws"])
-    if stop <= 18:
+    if stop <= 12:
         second.train_offline()
     second.update()
     for name, learner in whole.learners.items():
@@ -321,11 +323,11 @@ def test_a_copy_of_a_trainer_draws_from_a_buffer_of_its_own(make_agent, filled):
     trainer = trainer_of(agent, buffer, loss=LossOptions(failure_weight=0.5))
     for other in (copy.deepcopy(trainer), pickle.loads(pickle.dumps(trainer))):
         assert other.buffer is not buffer
-        buffer.sample = other.buffer.sample = None  # whoever draws from it says so
+        buffer.draw = other.buffer.draw = None  # whoever draws from it says so
         for name in LEARNERS:
             with pytest.raises(TypeError):
                 other.learners[name].sample()
-        del buffer.sample
+        del buffer.draw
         for name in LEARNERS:
             with pytest.raises(TypeError):
                 other.learners[name].sample()

@@ -1,0 +1,238 @@
+"""Forked processes that train, and report to the one that they were forked from."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+import torch
+
+#: Seconds without a word after which a process is given up, and between looks at those that are silent.
+_SILENCE, _TICK = 120.0, 0.2
+_STATE, _END = "state", None
+
+
+@dataclass
+class Report:
+    """What a process says.
+
+    Attributes:
+        steps: taken since the last report.
+        text: how it goes.
+        scalars: metrics to log: whose they are, their name, their value and the step.
+        state: of what it trains.
+        error: that ended it.
+        all_states: whether with this one every process has sent the state that it was asked for.
+    """
+
+    steps: int = 0
+    text: str = ""
+    scalars: list[tuple[str, str, float, int]] = field(default_factory=list)
+    state: dict[str, Any] | None = None
+    error: Exception | None = None
+    all_states: bool = False
+
+
+class _Worker:
+    """A process, and what it is doing."""
+
+    def __init__(self, process: Any, connection: Connection) -> None:
+        self.process, self.connection = process, connection
+        self.task: int | None = None
+        self.heard = time.monotonic()
+
+
+class Processes:
+    """Carries out tasks in forked processes, each by the next process that is free.
+
+    A process knows everything that there was when it was forked, and nothing that it changes is seen outside except by
+    its reports. One that dies, or says nothing for two minutes, is given up with a warning, and its task stays undone.
+
+    Args:
+        target: carries out a task, and calls what it is given with reports; that returns whether a state is asked for.
+            The last report of a task has a state.
+        tasks: what it is called with.
+        workers: number of processes.
+    """
+
+    def __init__(
+        self, target: Callable[[Any, Callable[[Report], bool]], None], tasks: Sequence[Any], workers: int
+    ) -> None:
+        self._target, self._tasks = target, list(tasks)
+        self._waiting = list(range(len(self._tasks)))
+        self._asked: set[int] = set()  # tasks whose states are awaited
+        context = multiprocessing.get_context("fork")
+        self._workers: list[_Worker] = []
+        for _ in range(workers):
+            ours, theirs = context.Pipe()
+            process = context.Process(target=self._work, args=(theirs, os.getpid()), daemon=True)
+            with warnings.catch_warnings():
+                # Later Pythons warn of locks that other threads hold. These are idle, and silence is waited out.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                process.start()
+            theirs.close()
+            self._workers.append(_Worker(process, ours))
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End all of them."""
+        for worker in self._workers:
+            worker.process.kill()
+        for worker in self._workers:
+            worker.process.join()
+            worker.connection.close()
+
+    def ask_for_states(self) -> None:
+        """Let every process that works send a state between two steps."""
+        for worker in self._workers:
+            if worker.task is not None and worker.task not in self._asked:
+                self._asked.add(worker.task)
+                self._tell(worker, _STATE)
+
+    def reports(self) -> Iterator[Report | None]:
+        """What the processes say until all tasks are done, and ``None`` now and then when they are silent."""
+        for worker in self._workers:
+            self._give(worker)
+        while busy := {worker.connection: worker for worker in self._workers if worker.task is not None}:
+            spoken = [busy[connection] for connection in wait(list(busy), _TICK)]  # type: ignore[index]
+            for worker in spoken:
+                if (report := self._hear(worker)) is not None:
+                    yield report
+            for worker in set(busy.values()) - set(spoken):
+                if time.monotonic() - worker.heard > _SILENCE:
+                    self._give_up(worker)
+            yield None
+
+    def _give(self, worker: _Worker) -> None:
+        """The next task."""
+        worker.task, worker.heard = None, time.monotonic()
+        if self._waiting:
+            worker.task = self._waiting.pop(0)
+            self._tell(worker, worker.task)
+
+    def _tell(self, worker: _Worker, what: int | str) -> None:
+        with suppress(OSError):  # it is dead, as the next look at it will tell
+            worker.connection.send(what)
+
+    def _hear(self, worker: _Worker) -> Report | None:
+        try:
+            report, done = pickle.loads(worker.connection.recv_bytes())
+        except (EOFError, OSError):
+            self._give_up(worker)
+            return None
+        worker.heard = time.monotonic()
+        if report.state is not None and worker.task in self._asked:
+            self._asked.discard(worker.task)
+            report.all_states = not self._asked
+        if done:
+            self._give(worker)
+        return report
+
+    def _give_up(self, worker: _Worker) -> None:
+        warnings.warn(
+            f"A process that trained has ended or fallen silent (exit code {worker.process.exitcode}); what it trained "
+            "is trained again, one learner after another. The results stay the same. Was memory short?",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+        self._asked.discard(worker.task)  # type: ignore[arg-type]
+        worker.task = None
+        worker.process.kill()
+
+    def _work(self, connection: Connection, parent: int) -> None:
+        """What a process does: one task after another."""
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # A terminal sends Ctrl-C to all; who has forked this process ends it.
+            signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else signal.SIG_DFL)
+        torch.set_num_threads(1)
+        try:
+            while (task := connection.recv()) is not _END:
+                if task != _STATE:  # asked too late, when the task had just been done
+                    self._target(self._tasks[task], _Channel(connection, parent).send)
+                    connection.send_bytes(pickle.dumps((Report(), True)))
+        except (EOFError, OSError):
+            pass  # nobody listens any more
+        except BaseException:
+            traceback.print_exc()
+            raise
+
+
+class _Channel:
+    """A process's way to the one that has forked it."""
+
+    def __init__(self, connection: Connection, parent: int) -> None:
+        self._connection, self._parent = connection, parent
+
+    def send(self, report: Report) -> bool:
+        """Send a report; whether a state is asked for."""
+        if os.getppid() != self._parent:
+            os._exit(1)  # nobody will come for what is trained here
+        self._connection.send_bytes(pickle.dumps((report, False)))
+        asked = False
+        while self._connection.poll():
+            asked |= self._connection.recv() == _STATE
+        return asked
+
+
+class Sender:
+    """In a process, reports what happens in the course of a task.
+
+    Args:
+        send: sends a report; whether a state is asked for.
+        state: makes the state.
+    """
+
+    def __init__(self, send: Callable[[Report], bool], state: Callable[[], dict[str, Any]]) -> None:
+        self._send, self._state = send, state
+        self.report, self._sent = Report(), time.monotonic()
+
+    def of(self, name: str) -> Voice:
+        """The progress bar or the logger of one learner."""
+        return Voice(self, name)
+
+    def now_and_then(self) -> None:
+        """Report, after a step, when some time has passed, and the state as well where it is asked for."""
+        if time.monotonic() - self._sent > _TICK:
+            self.flush()
+
+    def flush(self) -> None:
+        """Report now."""
+        report, self.report, self._sent = self.report, Report(), time.monotonic()
+        if self._send(report):
+            self._send(Report(state=self._state()))
+
+
+class Voice:
+    """What a learner takes for its progress bar and its logger.
+
+    Args:
+        sender: through which it is reported.
+        name: of the phase or the learner.
+    """
+
+    def __init__(self, sender: Sender, name: str) -> None:
+        self._sender, self._name = sender, name
+
+    def update(self, n: int = 1) -> None:
+        """``n`` more steps were taken."""
+        self._sender.report.steps += n
+
+    def set_postfix_str(self, s: str, refresh: bool = True) -> None:
+        """Say how it goes."""
+        self._sender.report.text = f"{self._name}: {s}"
+
+    def log_scalar(self, name: str, value: float, step: int | None = None, **_: Any) -> None:
+        """A metric."""
+        self._sender.report.scalars.append((self._name, name, value, step or 0))

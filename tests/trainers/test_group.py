@@ -1,0 +1,174 @@
+"""Learners side by side in processes: the results, metrics, states and errors of one after another."""
+
+import copy
+import math
+import os
+import signal
+import sys
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from ls3_torchrl.data import TaggedReplayBuffer
+from ls3_torchrl.trainers import DivergenceError, LS3Options, LS3Trainer, OfflineOptions, OnlineOptions, OptimOptions
+from ls3_torchrl.trainers import group as group_module
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
+
+
+@pytest.fixture(autouse=True)
+def two_cores(monkeypatch):
+    """Two threads, and processes for the least work, which tell their states all the time."""
+    before = torch.get_num_threads()
+    monkeypatch.setattr(group_module, "_WORTH_A_PROCESS", 1)
+    monkeypatch.setattr(group_module, "_INTERVAL", 0.0)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def forks(monkeypatch):
+    """The numbers of workers that were forked."""
+    counts, plain = [], group_module.Processes
+
+    def counted(target, tasks, workers):
+        counts.append(workers)
+        return plain(target, tasks, workers)
+
+    monkeypatch.setattr(group_module, "Processes", counted)
+    return counts
+
+
+@pytest.fixture
+def make_trainer(make_agent, episode):
+    def make(threads, seed=0, steps=30, **how):
+        torch.set_num_threads(threads)
+        torch.manual_seed(seed)
+        agent, buffer = make_agent(), TaggedReplayBuffer(100, latent_dim=8)
+        for tag, rises in {"success": {"success": 8}, "constraint": {"constraint": 5}}.items():
+            buffer.add(episode(actions=torch.randn(9, 2), **rises), tag)
+        buffer.encode(agent.encoder)
+        options = LS3Options(
+            OfflineOptions(steps, steps, steps, steps), OnlineOptions(steps, steps, steps), OptimOptions(16)
+        )
+        return LS3Trainer(agent, buffer, options, progress=False, **how)
+
+    return make
+
+
+def tensors(state, path=""):
+    """The leaves of a state, by path."""
+    if isinstance(state, dict):
+        return {k: v for name, part in state.items() for k, v in tensors(part, f"{path}/{name}").items()}
+    if isinstance(state, list | tuple):
+        return {k: v for i, part in enumerate(state) for k, v in tensors(part, f"{path}/{i}").items()}
+    return {path: state}
+
+
+def assert_same(state, expected):
+    one, other = tensors(state), tensors(expected)
+    assert one.keys() == other.keys()
+    for path, value in one.items():
+        same = torch.equal(value, other[path]) if isinstance(value, torch.Tensor) else value == other[path]
+        assert same, path
+
+
+def test_results_and_metrics_do_not_depend_on_the_number_of_cores(make_trainer, recorder, forks):
+    alone = make_trainer(1, logger=recorder)
+    aside = make_trainer(2, logger=(metrics := type(recorder)()))
+    for trainer, threads in ((alone, 1), (aside, 2)):
+        torch.set_num_threads(threads)
+        torch.manual_seed(7)
+        trainer.train_offline()
+        trainer.update()
+    assert forks == [2, 2]
+    assert_same(aside.state_dict(), alone.state_dict())
+    assert_same(dict(aside.agent.state_dict()), dict(alone.agent.state_dict()))
+    assert sorted(metrics.rows) == sorted(recorder.rows)
+    assert aside.goal.logger is metrics
+
+
+def test_a_state_from_the_middle_goes_on_with_one_core_or_two(make_trainer, forks):
+    whole = make_trainer(1, steps=120)
+    kept = []
+    first = make_trainer(2, steps=120, after_step=lambda: kept.append(copy.deepcopy(first.state_dict())))
+    for trainer in (whole, first):
+        torch.manual_seed(7)
+        trainer.train_offline()
+    middle = [state for state in kept if any(state[name]["phase_steps"] for name in first.learners)]
+    assert middle, "no state was taken in the middle"
+    for threads in (1, 2):
+        second = make_trainer(threads, seed=1, steps=120)
+        second.buffer.load_state_dict(first.buffer.state_dict())
+        second.load_state_dict(middle[len(middle) // 2])
+        second.train_offline()
+        for name, learner in whole.learners.items():
+            assert second.learners[name].steps == learner.steps
+            assert_same(second.learners[name].loss.state_dict(), learner.loss.state_dict())
+
+
+def test_what_after_step_raises_ends_the_training_and_its_processes(make_trainer, forks):
+    def stop():
+        raise InterruptedError
+
+    trainer = make_trainer(2, steps=100_000, after_step=stop)
+    with pytest.raises(InterruptedError):
+        trainer.train_offline()
+    assert forks == [2]
+    assert 0 < sum(learner.steps for learner in trainer.learners.values()) < 100_000
+    with pytest.raises(ChildProcessError):  # none is left
+        os.waitpid(-1, os.WNOHANG)
+
+
+def test_divergence_in_a_process_is_raised_with_its_step_and_leaves_finite_weights(make_trainer):
+    trainer = make_trainer(2)
+    weight = trainer.dynamics.parameters[0]
+    weight.register_hook(lambda gradient: gradient * (math.nan if trainer.dynamics.steps == 7 else 1.0))
+    with pytest.raises(DivergenceError, match=r"Dynamics diverged.*at step 7.*learning rate") as caught:
+        trainer.train_offline()
+    assert trainer.dynamics.steps == caught.value.step == 7
+    assert torch.isfinite(weight).all()
+
+
+def test_what_a_process_that_died_was_training_is_trained_all_the_same(make_trainer):
+    alone, aside = make_trainer(1), make_trainer(2)
+    here, weight = os.getpid(), aside.dynamics.parameters[0]
+
+    def die(gradient):
+        if os.getpid() != here and aside.dynamics.steps == 7:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return gradient
+
+    weight.register_hook(die)
+    torch.set_num_threads(1)
+    torch.manual_seed(7)
+    alone.train_offline()
+    torch.set_num_threads(2)
+    torch.manual_seed(7)
+    with pytest.warns(RuntimeWarning, match="results stay the same"):
+        aside.train_offline()
+    assert_same(aside.state_dict(), alone.state_dict())
+
+
+class Dropping(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.layers = torch.nn.Sequential(torch.nn.Linear(8, 8), torch.nn.Dropout(0.5), torch.nn.Linear(8, 1))
+
+    def forward(self, latent):
+        return self.layers(latent)
+
+
+def test_a_learner_whose_random_numbers_are_pytorchs_own_is_trained_here(make_agent, episode, forks):
+    agent = make_agent(value=TensorDictModule(Dropping(), ["latent"], ["state_value"]))
+    buffer = TaggedReplayBuffer(100, latent_dim=8)
+    buffer.add(episode(success=8, constraint=4), "success")
+    buffer.encode(agent.encoder)
+    trainer = LS3Trainer(agent, buffer, LS3Options(OfflineOptions(3, 3, 3, 3), optim=OptimOptions(16)), progress=False)
+    assert not trainer.value.is_independent
+    assert trainer.dynamics.is_independent
+    torch.set_num_threads(2)
+    trainer.train_offline()
+    assert forks == [2]
+    assert trainer.value.steps == trainer.dynamics.steps == 3
