@@ -95,9 +95,11 @@ class Processes:
             worker.connection.close()
 
     def ask_for_states(self) -> None:
-        """Let every process that works send a state between two steps."""
+        """Let every process that works send a state between two steps; nothing where some are still awaited."""
+        if self._asked:
+            return
         for worker in self._workers:
-            if worker.task is not None and worker.task not in self._asked:
+            if worker.task is not None:
                 self._asked.add(worker.task)
                 self._tell(worker, _STATE)
 

@@ -2,6 +2,7 @@
 
 import copy
 import math
+import multiprocessing
 import os
 import signal
 import sys
@@ -43,7 +44,7 @@ def forks(monkeypatch):
 @pytest.fixture
 def make_trainer(make_agent, episode):
     def make(threads, seed=0, steps=30, **how):
-        torch.set_num_threads(threads)
+        torch.set_num_threads(1)  # on which latents depend by their last bits
         torch.manual_seed(seed)
         agent, buffer = make_agent(), TaggedReplayBuffer(100, latent_dim=8)
         for tag, rises in {"success": {"success": 8}, "constraint": {"constraint": 5}}.items():
@@ -52,6 +53,7 @@ def make_trainer(make_agent, episode):
         options = LS3Options(
             OfflineOptions(steps, steps, steps, steps), OnlineOptions(steps, steps, steps), OptimOptions(16)
         )
+        torch.set_num_threads(threads)
         return LS3Trainer(agent, buffer, options, progress=False, **how)
 
     return make
@@ -117,8 +119,7 @@ def test_what_after_step_raises_ends_the_training_and_its_processes(make_trainer
         trainer.train_offline()
     assert forks == [2]
     assert 0 < sum(learner.steps for learner in trainer.learners.values()) < 100_000
-    with pytest.raises(ChildProcessError):  # none is left
-        os.waitpid(-1, os.WNOHANG)
+    assert not multiprocessing.active_children()
 
 
 def test_divergence_in_a_process_is_raised_with_its_step_and_leaves_finite_weights(make_trainer):
