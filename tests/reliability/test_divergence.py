@@ -5,6 +5,7 @@ import warnings
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tiny_runs import LS3, TINY
 
 from ls3_recipes.algorithms import ls3
@@ -63,7 +64,7 @@ def test_a_rate_that_is_far_too_large_stops_its_phase_at_the_step(tmp_path, phas
     assert str(kept) in error.__notes__[0]
     state = torch.load(kept / "state.pt", weights_only=True)
     assert finite(state["state"])  # the bad step was not taken
-    assert set(state["batch"]) & {"loc", "pixels", "action"}
+    assert set(state["batch"]) & {"latent", "pixels", "action"}
 
 
 @pytest.fixture
@@ -71,25 +72,26 @@ def poison(monkeypatch):
     """A function that makes what a phase learns from NaN from a step on, in the n-th of its trainings."""
 
     def spoil(phase, step, training=0):
-        train, seen = Learner.train, []
+        begin, seen = Learner.begin, []
 
-        def poisoned(self, steps, name):
+        def poisoned(self, steps, name, seed):
             if name == phase:
                 seen.append(name)
             if name == phase and len(seen) > training:
-                draw, first = self.sample, self.steps
+                draw, first = self.new_batch, self.steps
 
                 def sample():
                     rows = draw()
                     if self.steps - first >= step:
-                        for key in ("latent", ("next", "latent"), "loc", ("next", "loc")):
-                            rows.get(key).fill_(torch.nan)
+                        for key in rows.keys(include_nested=True, leaves_only=True):
+                            if "latent" in key:
+                                rows[key].fill_(torch.nan)
                     return rows
 
-                self.sample = sample
-            train(self, steps, name)
+                self.new_batch = sample
+            begin(self, steps, name, seed)
 
-        monkeypatch.setattr(Learner, "train", poisoned)
+        monkeypatch.setattr(Learner, "begin", poisoned)
 
     return spoil
 
@@ -101,7 +103,8 @@ def test_nan_in_a_batch_stops_the_phase_at_the_step(poison, tmp_path, phase):
     assert (error.phase, error.step) == (phase, 3)
     state = torch.load(tmp_path / "run" / "diverged" / "state.pt", weights_only=True)
     assert finite(state["state"])
-    assert torch.isnan(state["batch"]["latent"]).all()
+    batch = TensorDict(state["batch"])
+    assert torch.isnan(batch["latent" if "latent" in batch else ("next", "latent")]).all()
 
 
 @pytest.mark.parametrize("phase", [phase for phase in PHASES if phase != "Value, reward-to-go"])

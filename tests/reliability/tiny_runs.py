@@ -91,7 +91,7 @@ def _name_phases(where, hold):
     told(RunFolder, "thin_out_agents", "planning")  # the last of an update
     told(VAETrainer, "_minimise", "VAE")
     told(VAETrainer, "encode", "encoding")
-    told(Learner, "train", None)
+    told(Learner, "begin", None)
     told(Checkpoints, "save", "saving")
 
 

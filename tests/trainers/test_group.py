@@ -103,7 +103,7 @@ def test_a_state_from_the_middle_goes_on_with_one_core_or_two(make_trainer, fork
     for threads in (1, 2):
         second = make_trainer(threads, seed=1, steps=120)
         second.buffer.load_state_dict(first.buffer.state_dict())
-        second.load_state_dict(middle[len(middle) // 2])
+        second.load_state_dict(copy.deepcopy(middle[len(middle) // 2]))
         second.train_offline()
         for name, learner in whole.learners.items():
             assert second.learners[name].steps == learner.steps
