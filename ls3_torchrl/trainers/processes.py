@@ -156,8 +156,8 @@ class Processes:
     def _work(self, connection: Connection, parent: int) -> None:
         """What a process does: one task after another."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            # A terminal sends Ctrl-C to all; who has forked this process ends it.
-            signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else signal.SIG_DFL)
+            # A terminal sends Ctrl-C to all, a service manager SIGTERM; who has forked this process ends it.
+            signal.signal(number, signal.SIG_IGN)
         torch.set_num_threads(1)
         try:
             while (task := connection.recv()) is not _END:

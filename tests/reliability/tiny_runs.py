@@ -176,8 +176,10 @@ def _summary(folder):
 
 
 def _metrics(folder):
+    """The rows of every phase in their order; those of phases side by side lie between each other as they came."""
     with (folder / "metrics.csv").open(newline="", encoding="utf-8") as file:
-        return [[row[name] for name in ("phase", "step", "name", "value")] for row in csv.DictReader(file)]
+        rows = [[row[name] for name in ("phase", "step", "name", "value")] for row in csv.DictReader(file)]
+    return sorted(rows, key=lambda row: row[0])
 
 
 def _names(folder):
