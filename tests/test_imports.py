@@ -13,7 +13,7 @@ RECIPES = {"ls3_recipes"} | {path.stem for path in (ROOT / "recipes").glob("*.py
 MAY_IMPORT = {
     "_checks": set(),
     "modules": {"_checks"},
-    "objectives": {"_checks", "modules"},
+    "objectives": {"_checks", "layers", "modules"},
     "layers": {"_checks", "modules"},
     "planners": {"_checks", "layers", "modules"},
     "data": {"_checks", "files", "modules"},

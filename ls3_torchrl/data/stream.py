@@ -10,6 +10,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from ls3_torchrl._checks import require_keys
 from ls3_torchrl.data.buffer import TaggedReplayBuffer
 from ls3_torchrl.data.keys import as_tuple
 from ls3_torchrl.data.selection import RowSelection
@@ -119,6 +120,7 @@ class BatchStream:
         if steps is not None:
             index = self.buffer.transitions.later(index.unsqueeze(-1), torch.arange(steps, device=index.device))
         rows = self.buffer.transitions.storage[:]
+        require_keys(rows, [key for key in keys if key not in _LATENTS], "A batch")
         batch = TensorDict({}, [count, *shape, *([] if steps is None else [steps])], device=self.buffer.device)
         for key in keys:
             entry = self._entry(rows, key, index.flatten()).unflatten(0, index.shape)

@@ -15,7 +15,14 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 from ls3_torchrl.modules import PixelEncoder, SafeSet, ValueEnsemble, probability_of
-from ls3_torchrl.modules.call import call_on_latent, call_with_params, encode, posterior_keys
+from ls3_torchrl.modules.call import (
+    Weights,
+    asks_of_latent_alone,
+    call_on_latent,
+    call_with_params,
+    encode,
+    posterior_keys,
+)
 
 
 def module(out_keys: list, in_keys: list | None = None) -> TensorDictModule:
@@ -139,3 +146,64 @@ def test_a_forward_of_ones_own_is_not_bypassed():
     td = TensorDict({"pixels": torch.randint(256, (3, 3, 64, 64), dtype=torch.uint8)}, [3])
     inner: Tensor = encoder[0](td.copy())["loc"]
     assert torch.equal(encode(encoder, td)[0], 2 * inner)
+
+
+# Weights in the place of a network's own
+
+
+def test_weights_in_place_are_those_of_a_functional_call_and_the_own_ones_come_back():
+    safe_set, latent = SafeSet(8), torch.randn(4, 8)
+    own = dict(safe_set.named_parameters())
+    weights = Weights(safe_set, params_of(safe_set, 0.5))
+    expected = torch.func.functional_call(safe_set, weights.by_name, (TensorDict({"latent": latent}, [4]),))
+    assert torch.equal(call_on_latent(safe_set, latent, params=weights), expected["safe_set_logit"])
+    with pytest.raises(ValueError, match="shape"), weights.in_place():
+        safe_set.of_latent(torch.randn(4, 9))
+    assert all(parameter is own[name] for name, parameter in safe_set.named_parameters())
+
+
+def test_buffers_are_replaced_as_well():
+    network = TensorDictModule(nn.BatchNorm1d(2).eval(), ["latent"], ["out"])
+    latent = torch.ones(3, 2)
+    params = params_of(network, 1.0)
+    params.data["module", "running_mean"].fill_(1.0)
+    assert call_on_latent(network, latent, params=Weights(network, params)).abs().max() == 0.0
+    assert call_on_latent(network, latent).min() > 0.9
+
+
+# Modules that are asked for what their forward writes
+
+
+class Shifted(SafeSet):
+    def of_latent(self, latent: Tensor) -> Tensor:
+        return super().of_latent(latent) + 1.0
+
+
+class Squared(SafeSet):
+    def forward(self, tensordict: TensorDict) -> TensorDict:
+        out = super().forward(tensordict)
+        return out.set("safe_set_logit", out["safe_set_logit"] ** 2)
+
+
+def test_a_module_is_asked_directly_where_nothing_is_bypassed():
+    assert asks_of_latent_alone(SafeSet(8))
+    assert asks_of_latent_alone(ValueEnsemble(8))
+    assert not asks_of_latent_alone(module(["out"]))
+    assert not asks_of_latent_alone(Squared(8))
+
+
+@pytest.mark.parametrize("kind", [SafeSet, Shifted, Squared])
+def test_the_direct_answer_is_that_of_a_call(kind: type):
+    network, latent = kind(8), torch.randn(4, 8)
+    assert torch.equal(call_on_latent(network, latent), network(TensorDict({"latent": latent}, [4]))["safe_set_logit"])
+
+
+def test_hooks_and_a_replaced_forward_are_called():
+    network, seen = SafeSet(8), []
+    network.register_forward_hook(lambda *_: seen.append("hook"))
+    call_on_latent(network, torch.randn(4, 8))
+    other = SafeSet(8)
+    forward = other.forward
+    other.forward = lambda tensordict: seen.append("own") or forward(tensordict)
+    call_on_latent(other, torch.randn(4, 8))
+    assert seen == ["hook", "own"]

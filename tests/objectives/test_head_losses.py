@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torchrl.objectives import HardUpdate
 
 from ls3_torchrl.modules import ConstraintEstimator, GoalEstimator, SafeSet
 from ls3_torchrl.objectives import ClassifierLoss, OfflineValueLoss, SafeSetLoss
@@ -12,7 +13,9 @@ from ls3_torchrl.objectives.head import StackedHeads
 
 def three(hidden=(16, 16)):
     heads = [kind(4, hidden=hidden) for kind in (SafeSet, ConstraintEstimator, GoalEstimator)]
-    return [SafeSetLoss(heads[0]), *map(ClassifierLoss, heads[1:])]
+    safe_set = SafeSetLoss(heads[0])
+    HardUpdate(safe_set, value_network_update_interval=99)
+    return [safe_set, *map(ClassifierLoss, heads[1:])]
 
 
 def batch(size=32):
@@ -28,7 +31,10 @@ def test_stacked_losses_and_gradients_are_those_of_each_alone():
     assert StackedHeads.can_stack(losses)
     names = [loss.out_keys[0] for loss in losses]
     found = []
-    for compute in (StackedHeads(losses).losses, lambda rows: [one.losses(b) for one, b in zip(losses, rows)]):
+    for compute in (
+        StackedHeads(losses).losses,
+        lambda rows: [one.losses(b) for one, b in zip(losses, rows, strict=True)],
+    ):
         for loss in losses:
             loss.zero_grad()
         outputs = compute(batches)
