@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,6 +24,10 @@ Chain: TypeAlias = list[Unit]
 _WORTH_A_PROCESS = 200
 #: Seconds between two calls of ``after_step`` while learners are trained in other processes.
 _INTERVAL = 2.0
+#: How many parameters take as long as the rest of a step.
+_PARAMETERS = 100_000
+#: What a process that is nicer by one gets less of a core it shares: the scheduler's weights are powers of it.
+_NICE = 1.25
 
 
 class LearnerGroup:
@@ -76,9 +81,12 @@ class LearnerGroup:
             self._stages = wanted
             self._seeds = [new_seed() if self.learners[name].streams else None for name, _, _ in wanted]
         chains = [chain for chain in self._chains() if all(self._learner(i).is_independent for i in _flat(chain))]
-        workers = min(len(chains), torch.get_num_threads())
-        if workers > 1 and self._steps(chains) >= _WORTH_A_PROCESS and _may_fork(self.learners.values()):
-            self._train_side_by_side(chains, workers)
+        if (
+            min(len(chains), torch.get_num_threads()) > 1
+            and self._steps(chains) >= _WORTH_A_PROCESS
+            and _may_fork(self.learners.values())
+        ):
+            self._train_side_by_side(chains)
         for unit in self._units():
             self._train_here(unit)
         self._stages, self._seeds, self._finished = [], [], []
@@ -140,16 +148,19 @@ class LearnerGroup:
             chains.append((touched, mine))
         return [sorted(chain) for _, chain in chains]
 
-    def _train_side_by_side(self, chains: Sequence[Chain], workers: int) -> None:
-        """Train chains in processes, the most work first."""
-        chains = sorted(chains, key=lambda chain: -sum(self._work(i) for i in _flat(chain)))
+    def _train_side_by_side(self, chains: Sequence[Chain]) -> None:
+        """Train chains in processes."""
+        work = [sum(self._work(i) for i in _flat(chain)) for chain in chains]
+        crowded = len(chains) > torch.get_num_threads()
+        # Where they share cores, each gets a share by its work, and all end at about the same time.
+        nice = [round(math.log(max(work) / own, _NICE)) if crowded else 0 for own in work]
         involved = [self._learner(i) for chain in chains for i in _flat(chain)]
         callbacks = _callbacks(involved)
         done = sum(self._steps_done(i) for chain in chains for i in chain[0])
         shown = any(learner.progress for learner in involved)
         with (
             progress_bar(self._steps(chains), "Learning", done=done, enabled=shown) as bar,
-            Processes(self._train_chain, chains, workers) as processes,
+            Processes(self._train_chain, chains, nice) as processes,
         ):
             last = time.monotonic()
             for report in processes.reports():
@@ -171,9 +182,10 @@ class LearnerGroup:
                     for callback in callbacks:
                         callback()
 
-    def _work(self, index: int) -> int:
+    def _work(self, index: int) -> float:
         """About how much a stage takes, compared with others."""
-        return self._stages[index][1] * sum(parameter.numel() for parameter in self._learner(index).parameters)
+        parameters = sum(parameter.numel() for parameter in self._learner(index).parameters)
+        return max(self._stages[index][1], 1) * (parameters + _PARAMETERS)
 
     def _train_chain(self, chain: Chain, send: Callable[[Report], bool]) -> None:
         """Train a chain in a process of its own."""

@@ -19,7 +19,7 @@ import torch
 
 #: Seconds without a word after which a process is given up, and between looks at those that are silent.
 _SILENCE, _TICK = 120.0, 0.2
-_STATE, _END = "state", None
+_STATE = "state"
 
 
 @dataclass
@@ -44,16 +44,15 @@ class Report:
 
 
 class _Worker:
-    """A process, and what it is doing."""
+    """A process, and whether it is still at work."""
 
     def __init__(self, process: Any, connection: Connection) -> None:
         self.process, self.connection = process, connection
-        self.task: int | None = None
-        self.heard = time.monotonic()
+        self.busy, self.heard = True, time.monotonic()
 
 
 class Processes:
-    """Carries out tasks in forked processes, each by the next process that is free.
+    """Carries out tasks in forked processes, one for each.
 
     A process knows everything that there was when it was forked, and nothing that it changes is seen outside except by
     its reports. One that dies, or says nothing for two minutes, is given up with a warning, and its task stays undone.
@@ -62,20 +61,19 @@ class Processes:
         target: carries out a task, and calls what it is given with reports; that returns whether a state is asked for.
             The last report of a task has a state.
         tasks: what it is called with.
-        workers: number of processes.
+        nice: of each process; where there are more processes than cores, those of higher numbers get less time.
     """
 
     def __init__(
-        self, target: Callable[[Any, Callable[[Report], bool]], None], tasks: Sequence[Any], workers: int
+        self, target: Callable[[Any, Callable[[Report], bool]], None], tasks: Sequence[Any], nice: Sequence[int]
     ) -> None:
-        self._target, self._tasks = target, list(tasks)
-        self._waiting = list(range(len(self._tasks)))
-        self._asked: set[int] = set()  # tasks whose states are awaited
+        self._target = target
+        self._asked: set[_Worker] = set()  # whose states are awaited
         context = multiprocessing.get_context("fork")
         self._workers: list[_Worker] = []
-        for _ in range(workers):
+        for task, number in zip(tasks, nice, strict=True):
             ours, theirs = context.Pipe()
-            process = context.Process(target=self._work, args=(theirs, os.getpid()), daemon=True)
+            process = context.Process(target=self._work, args=(task, number, theirs, os.getpid()), daemon=True)
             with warnings.catch_warnings():
                 # Later Pythons warn of locks that other threads hold. These are idle, and silence is waited out.
                 warnings.simplefilter("ignore", DeprecationWarning)
@@ -99,15 +97,14 @@ class Processes:
         if self._asked:
             return
         for worker in self._workers:
-            if worker.task is not None:
-                self._asked.add(worker.task)
-                self._tell(worker, _STATE)
+            if worker.busy:
+                self._asked.add(worker)
+                with suppress(OSError):  # it is dead, as the next look at it will tell
+                    worker.connection.send(_STATE)
 
     def reports(self) -> Iterator[Report | None]:
         """What the processes say until all tasks are done, and ``None`` now and then when they are silent."""
-        for worker in self._workers:
-            self._give(worker)
-        while busy := {worker.connection: worker for worker in self._workers if worker.task is not None}:
+        while busy := {worker.connection: worker for worker in self._workers if worker.busy}:
             spoken = [busy[connection] for connection in wait(list(busy), _TICK)]  # type: ignore[index]
             for worker in spoken:
                 if (report := self._hear(worker)) is not None:
@@ -117,17 +114,6 @@ class Processes:
                     self._give_up(worker)
             yield None
 
-    def _give(self, worker: _Worker) -> None:
-        """The next task."""
-        worker.task, worker.heard = None, time.monotonic()
-        if self._waiting:
-            worker.task = self._waiting.pop(0)
-            self._tell(worker, worker.task)
-
-    def _tell(self, worker: _Worker, what: int | str) -> None:
-        with suppress(OSError):  # it is dead, as the next look at it will tell
-            worker.connection.send(what)
-
     def _hear(self, worker: _Worker) -> Report | None:
         try:
             report, done = pickle.loads(worker.connection.recv_bytes())
@@ -135,11 +121,12 @@ class Processes:
             self._give_up(worker)
             return None
         worker.heard = time.monotonic()
-        if report.state is not None and worker.task in self._asked:
-            self._asked.discard(worker.task)
+        if report.state is not None and worker in self._asked:
+            self._asked.remove(worker)
             report.all_states = not self._asked
         if done:
-            self._give(worker)
+            worker.busy = False
+            self._asked.discard(worker)  # asked too late
         return report
 
     def _give_up(self, worker: _Worker) -> None:
@@ -149,21 +136,21 @@ class Processes:
             RuntimeWarning,
             stacklevel=4,
         )
-        self._asked.discard(worker.task)  # type: ignore[arg-type]
-        worker.task = None
+        self._asked.discard(worker)
+        worker.busy = False
         worker.process.kill()
 
-    def _work(self, connection: Connection, parent: int) -> None:
-        """What a process does: one task after another."""
+    def _work(self, task: Any, nice: int, connection: Connection, parent: int) -> None:
+        """What a process does."""
+        os.nice(nice)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             # A terminal sends Ctrl-C to all, a service manager SIGTERM; who has forked this process ends it.
             signal.signal(number, signal.SIG_IGN)
         torch.set_num_threads(1)
         try:
-            while (task := connection.recv()) is not _END:
-                if task != _STATE:  # asked too late, when the task had just been done
-                    self._target(self._tasks[task], _Channel(connection, parent).send)
-                    connection.send_bytes(pickle.dumps((Report(), True)))
+            self._target(task, _Channel(connection, parent).send)
+            connection.send_bytes(pickle.dumps((Report(), True)))
+            connection.recv()  # until all have ended, or there is nobody to end them
         except (EOFError, OSError):
             pass  # nobody listens any more
         except BaseException:

@@ -39,9 +39,9 @@ def is_alive(number):
 
 
 def while_side_by_side(folder, chance, *settings):
-    """A run that is learning in two processes, and these."""
+    """A run that is learning in three processes, and these."""
     run = Run([*TWO, *settings, f"output={folder}"], f"{folder}.log").begun()
-    while len(forked := processes_of(run)) < 2 and run.process.is_alive():
+    while len(forked := processes_of(run)) < 3 and run.process.is_alive():
         time.sleep(0.001)
     time.sleep(chance.random())
     return run, forked
@@ -58,7 +58,7 @@ def all_have_ended(forked):
 @pytest.mark.parametrize("seed", range(2))
 def test_a_killed_run_takes_its_processes_along_and_goes_on_to_the_same_bits(uncut, tmp_path, seed):
     run, forked = while_side_by_side(tmp_path / "run", random.Random(seed), ALWAYS)
-    assert len(forked) == 2
+    assert len(forked) == 3
     run.process.kill()
     run.ended()
     assert all_have_ended(forked)

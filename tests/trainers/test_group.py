@@ -30,12 +30,12 @@ def two_cores(monkeypatch):
 
 @pytest.fixture
 def forks(monkeypatch):
-    """The numbers of workers that were forked."""
+    """The numbers of processes that were forked."""
     counts, plain = [], group_module.Processes
 
-    def counted(target, tasks, workers):
-        counts.append(workers)
-        return plain(target, tasks, workers)
+    def counted(target, tasks, nice):
+        counts.append(len(tasks))
+        return plain(target, tasks, nice)
 
     monkeypatch.setattr(group_module, "Processes", counted)
     return counts
@@ -84,7 +84,7 @@ def test_results_and_metrics_do_not_depend_on_the_number_of_cores(make_trainer, 
         torch.manual_seed(7)
         trainer.train_offline()
         trainer.update()
-    assert forks == [2, 2]
+    assert forks == [3, 3]
     assert_same(aside.state_dict(), alone.state_dict())
     assert_same(dict(aside.agent.state_dict()), dict(alone.agent.state_dict()))
     assert sorted(metrics.rows) == sorted(recorder.rows)
@@ -117,7 +117,7 @@ def test_what_after_step_raises_ends_the_training_and_its_processes(make_trainer
     trainer = make_trainer(2, steps=100_000, after_step=stop)
     with pytest.raises(InterruptedError):
         trainer.train_offline()
-    assert forks == [2]
+    assert forks == [3]
     assert 0 < sum(learner.steps for learner in trainer.learners.values()) < 100_000
     assert not multiprocessing.active_children()
 
