@@ -22,7 +22,7 @@ Unit: TypeAlias = tuple[int, ...]
 Chain: TypeAlias = list[Unit]
 #: Gradient steps below which a process costs more than it gains.
 _WORTH_A_PROCESS = 200
-#: Seconds between two calls of ``after_step`` while learners are trained in other processes.
+#: Seconds between two states of what is trained in other processes, which ``after_step`` is called with.
 _INTERVAL = 2.0
 #: How many parameters take as long as the rest of a step.
 _PARAMETERS = 100_000
@@ -165,7 +165,7 @@ class LearnerGroup:
             last = time.monotonic()
             for report in processes.reports():
                 if report is None:  # now and then
-                    if callbacks and time.monotonic() - last > _INTERVAL:
+                    if time.monotonic() - last > _INTERVAL:
                         processes.ask_for_states()
                         last = time.monotonic()
                     continue
@@ -195,20 +195,19 @@ class LearnerGroup:
         def state() -> dict[str, Any]:
             return {"finished": list(finished), "learners": {n: self.learners[n].state_dict() for n in names}}
 
+        sender = Sender(send, state)
         try:
             for unit in chain:
-                sender = Sender(send, state)
                 for i in unit:
                     learner = self._learner(i)
                     learner.logger = None if learner.logger is None else sender.of(self._stages[i][0])  # type: ignore[assignment]
                 bars = [sender.of(self._stages[i][2]) for i in unit]
                 self._take_steps(unit, bars, sender.now_and_then)
-                sender.flush()
                 finished += unit
         except Exception as error:
-            send(Report(state=state(), error=error))
+            sender.send_state(error)
         else:
-            send(Report(state=state()))
+            sender.send_state()
 
     def _load(self, state: Mapping[str, Any]) -> None:
         """Take over what a process has trained."""

@@ -29,7 +29,7 @@ class Report:
     Attributes:
         steps: taken since the last report.
         text: how it goes.
-        scalars: metrics to log: whose they are, their name, their value and the step.
+        scalars: metrics to log, those between two states: whose they are, their name, their value and the step.
         state: of what it trains.
         error: that ended it.
         all_states: whether with this one every process has sent the state that it was asked for.
@@ -186,6 +186,8 @@ class Sender:
     def __init__(self, send: Callable[[Report], bool], state: Callable[[], dict[str, Any]]) -> None:
         self._send, self._state = send, state
         self.report, self._sent = Report(), time.monotonic()
+        #: Metrics since the last state. They are sent with the next: what is trained again after it is logged once.
+        self.scalars: list[tuple[str, str, float, int]] = []
 
     def of(self, name: str) -> Voice:
         """The progress bar or the logger of one learner."""
@@ -194,13 +196,17 @@ class Sender:
     def now_and_then(self) -> None:
         """Report, after a step, when some time has passed, and the state as well where it is asked for."""
         if time.monotonic() - self._sent > _TICK:
-            self.flush()
+            asked = self._send(self.report)
+            self.report, self._sent = Report(), time.monotonic()
+            if asked:
+                self.send_state()
 
-    def flush(self) -> None:
-        """Report now."""
-        report, self.report, self._sent = self.report, Report(), time.monotonic()
-        if self._send(report):
-            self._send(Report(state=self._state()))
+    def send_state(self, error: Exception | None = None) -> None:
+        """Report a state, and what has happened since the last."""
+        self.report.scalars, self.scalars = self.scalars, []
+        self.report.state, self.report.error = self._state(), error
+        self._send(self.report)
+        self.report = Report()
 
 
 class Voice:
@@ -224,4 +230,4 @@ class Voice:
 
     def log_scalar(self, name: str, value: float, step: int | None = None, **_: Any) -> None:
         """A metric."""
-        self._sender.report.scalars.append((self._name, name, value, step or 0))
+        self._sender.scalars.append((self._name, name, value, step or 0))
