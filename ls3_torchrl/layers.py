@@ -43,14 +43,18 @@ def layers_of(network: nn.Module, dtype: torch.dtype) -> Layers:
     ]
 
 
-def members_of(network: EnsembleMLP, dtype: torch.dtype) -> list[Layers]:
-    """Copies of an ensemble's layers, one member after another."""
+def stacked_of(network: EnsembleMLP, dtype: torch.dtype) -> Layers:
+    """Copies of an ensemble's layers: weights ``[M, in, out]`` and biases ``[M, 1, out]``."""
     return [
-        [
-            (weight[m].detach().T.to(dtype, copy=True).contiguous(), bias[m, 0].detach().to(dtype).clone())
-            for weight, bias in zip(network.weights, network.biases, strict=True)
-        ]
-        for m in range(network.num_members)
+        (weight.detach().to(dtype).clone(), bias.detach().to(dtype).clone())
+        for weight, bias in zip(network.weights, network.biases, strict=True)
+    ]
+
+
+def members_of(stacked: Layers) -> list[Layers]:
+    """Copies of stacked layers, one member after another, each as those of a network of its own."""
+    return [
+        [(weight[m].T.contiguous(), bias[m, 0].clone()) for weight, bias in stacked] for m in range(len(stacked[0][0]))
     ]
 
 
@@ -75,8 +79,31 @@ def run_layers(x: Tensor, layers: Layers) -> Tensor:
     for i, (weight, bias) in enumerate(layers):
         x = linear(x, weight, bias)
         if i < last:
-            x = x.relu_()
+            x = relu_(x)
     return x
+
+
+def run_stacked(x: Tensor, layers: Layers) -> Tensor:
+    """M ReLU networks on rows ``[M, R, in]``, each on its own: weights ``[M, in, out]`` and biases ``[M, 1, out]``.
+
+    A product here costs some 20 microseconds before its first number: one for all members, where each has few rows, is
+    several times faster than one for each.
+    """
+    last = len(layers) - 1
+    for i, (weight, bias) in enumerate(layers):
+        x = torch.baddbmm(bias, x, weight)
+        if i < last:
+            x = relu_(x)
+    return x
+
+
+def relu_(x: Tensor) -> Tensor:
+    """ReLU in place. NaN in bf16 on a CPU may become 0, as it does in the fused layers."""
+    if x.dtype == torch.bfloat16 and x.device.type == "cpu":
+        # Numbers below zero are integers below zero, and integers are compared four times faster than bf16.
+        x.view(torch.int16).relu_()
+        return x
+    return x.relu_()
 
 
 @lru_cache(maxsize=4)
