@@ -28,13 +28,13 @@ class Grouping(NamedTuple):
 
 def group_by_member(members: Tensor) -> list[Grouping]:
     """Of members ``[H, P]`` that move particles, the grouping of each step."""
-    found = []
+    sorts, backs, counts = [], [], []
     for step in members.tolist():  # in plain Python: these are a hundred numbers, and an operation on tensors is slow
-        order = sorted(range(len(step)), key=step.__getitem__)
-        back = sorted(range(len(step)), key=order.__getitem__)
-        found.append((order, back, [(m, step.count(m)) for m in sorted(set(step))]))
-    together = torch.tensor([(order, back) for order, back, _ in found])
-    return [Grouping(order, back, counts) for (order, back), (_, _, counts) in zip(together, found, strict=True)]
+        sorts.append(sorted(range(len(step)), key=step.__getitem__))
+        backs.append(sorted(range(len(step)), key=sorts[-1].__getitem__))
+        counts.append([(m, step.count(m)) for m in sorted(set(step))])
+    orders = torch.tensor(sorts + backs).unbind()
+    return [Grouping(*of_step) for of_step in zip(orders[: len(sorts)], orders[len(sorts) :], counts, strict=True)]
 
 
 def unroll(
@@ -59,26 +59,30 @@ def unroll(
         groups: the same, grouped; with ``None`` the weights are gathered instead, and nothing waits for the device.
         noise: ``[H, P, R or 1, D]``; ``None`` when it is zero.
     """
-    (horizon, rows, _), particles = plan.shape, members.shape[1]
+    (horizon, rows, _), particles, d = plan.shape, members.shape[1], latent.shape[-1]
     unit = plan / dynamics.action_scale
     if dynamics.control_affine:
-        unit = unit.float().unsqueeze(-1).expand(-1, -1, -1, dynamics.latent_dim).contiguous()
-    path = torch.empty(horizon, particles, rows, latent.shape[-1], dtype=snapshot.dtype, device=latent.device)
+        unit = unit.float().unsqueeze(-1).expand(-1, -1, -1, d).contiguous()
+    path = torch.empty(horizon, particles, rows, d, dtype=snapshot.dtype, device=latent.device)
     state, x = latent, latent.to(snapshot.dtype).expand(particles, -1, -1)
     for t in range(horizon):
         if not dynamics.control_affine:
             if t == 0:
-                state, x = (_of_plans(part, row_of, rows) for part in (state, x))
+                x = _of_plans(x, row_of, rows)
             x = torch.cat([x, unit[t].to(x.dtype).expand(particles, -1, -1)], -1)
         output = _move_together(snapshot, x, members[t]) if groups is None else _move_by_member(snapshot, x, groups[t])
         output = output.float()
-        if dynamics.control_affine and t == 0 and row_of is not None:
-            # The network has not seen any action yet: plans from one latent share what it wrote.
-            state, output = state.index_select(0, row_of), output.index_select(1, row_of)
-        delta, log_scale = _read(dynamics, output, unit[t])
-        state = state + delta
+        if t == 0:
+            # Control-affine networks have not seen any action yet: plans from one latent share what was written.
+            output = _of_plans(output, row_of, rows) if dynamics.control_affine else output
+            state = _of_plans(state, row_of, rows)
+        state = state + output[..., :d]
+        if dynamics.control_affine:
+            for a in range(dynamics.action_dim):
+                state.addcmul_(output[..., (2 + a) * d : (3 + a) * d], unit[t, :, a])
         if noise is not None:
-            state = torch.addcmul(state, log_scale.clamp(*dynamics.log_scale_bounds).exp(), noise[t])
+            scale = output[..., d : 2 * d].clamp(*dynamics.log_scale_bounds).exp_()
+            state = state.addcmul_(scale, noise[t])
         x = path[t].copy_(state)
     return path
 
@@ -86,16 +90,6 @@ def unroll(
 def _of_plans(x: Tensor, row_of: Tensor | None, rows: int) -> Tensor:
     """What is known of latents ``[..., k, n]`` for each plan ``[..., R, n]``."""
     return x.expand(*x.shape[:-2], rows, -1) if row_of is None else x.index_select(-2, row_of)
-
-
-def _read(dynamics: EnsembleDynamics, output: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
-    """``EnsembleDynamics.read_output`` of the snapshot's order of numbers, without the clamp."""
-    d = dynamics.latent_dim
-    delta, log_scale = output[..., :d], output[..., d : 2 * d]
-    if dynamics.control_affine:
-        gain = output[..., 2 * d :].unflatten(-1, (dynamics.action_dim, d))
-        delta = delta + (gain * unit).sum(-2)
-    return delta, log_scale
 
 
 def _move_by_member(snapshot: Snapshot, x: Tensor, group: Grouping) -> Tensor:
