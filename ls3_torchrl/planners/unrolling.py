@@ -60,30 +60,28 @@ def unroll(
         noise: ``[H, P, R or 1, D]``; ``None`` when it is zero.
     """
     (horizon, rows, _), particles, d = plan.shape, members.shape[1], latent.shape[-1]
-    unit = plan / dynamics.action_scale
+    units = (plan / dynamics.action_scale).float()
     if dynamics.control_affine:
-        unit = unit.float().unsqueeze(-1).expand(-1, -1, -1, d).contiguous()
+        units = units.unsqueeze(-1).expand(-1, -1, -1, d).contiguous()
     path = torch.empty(horizon, particles, rows, d, dtype=snapshot.dtype, device=latent.device)
     state, x = latent, latent.to(snapshot.dtype).expand(particles, -1, -1)
-    for t in range(horizon):
+    for t, (unit, arrived) in enumerate(zip(units.unbind(), path.unbind(), strict=True)):
         if not dynamics.control_affine:
-            if t == 0:
-                x = _of_plans(x, row_of, rows)
-            x = torch.cat([x, unit[t].to(x.dtype).expand(particles, -1, -1)], -1)
+            x = _of_plans(x, row_of, rows) if t == 0 else x
+            x = torch.cat([x, unit.to(x.dtype).expand(particles, -1, -1)], -1)
         output = _move_together(snapshot, x, members[t]) if groups is None else _move_by_member(snapshot, x, groups[t])
         output = output.float()
         if t == 0:
             # Control-affine networks have not seen any action yet: plans from one latent share what was written.
             output = _of_plans(output, row_of, rows) if dynamics.control_affine else output
             state = _of_plans(state, row_of, rows)
-        state = state + output[..., :d]
-        if dynamics.control_affine:
-            for a in range(dynamics.action_dim):
-                state.addcmul_(output[..., (2 + a) * d : (3 + a) * d], unit[t, :, a])
+        delta, log_scale, *gain = output.split(d, -1)
+        state = state + delta
+        for change, along in zip(gain, unit.unbind(1), strict=False):  # none where the network has seen the action
+            state.addcmul_(change, along)
         if noise is not None:
-            scale = output[..., d : 2 * d].clamp(*dynamics.log_scale_bounds).exp_()
-            state = state.addcmul_(scale, noise[t])
-        x = path[t].copy_(state)
+            state.addcmul_(log_scale.clamp(*dynamics.log_scale_bounds).exp_(), noise[t])
+        x = arrived.copy_(state)
     return path
 
 
