@@ -9,7 +9,15 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from ls3_torchrl.layers import Layers, Precision, fastest_precision, layers_of, members_of, stacked_of
+from ls3_torchrl.layers import (
+    Layers,
+    Precision,
+    fastest_precision,
+    keep_freed_memory,
+    layers_of,
+    members_of,
+    stacked_of,
+)
 from ls3_torchrl.planners.latent_env import LatentEnv
 
 
@@ -82,6 +90,8 @@ class Snapshot:
             return False
         self._require_finite()
         device = parameters[0].device
+        if device.type == "cpu":
+            keep_freed_memory()
         chosen = fastest_precision(device.type) if self._precision == "auto" else self._precision
         self.dtype = torch.bfloat16 if chosen == "bf16" else torch.float32
         columns = _output_columns(self._env.dynamics).to(device)
