@@ -205,7 +205,7 @@ class FusedImagination:
         noise: Tensor | None,
         limits: Limits | None,
     ) -> PlanStatistics:
-        """Statistics of the plans ``[H, R, A]``; for the arguments see :func:`~ls3_torchrl.planners.unrolling.unroll`."""
+        """Statistics of the plans ``[H, R, A]``; the arguments are those of ``unroll``, and limits."""
         horizon, r, _ = plan.shape
         path = unroll(self.env.dynamics, self._snapshot, latent, row_of, plan, members, groups, noise)
         violating = self._probability("constraint", path)
@@ -216,17 +216,15 @@ class FusedImagination:
         value = latent.new_full((r, len(self._snapshot.value)), torch.nan)
         goal = latent.new_full((horizon, r), torch.nan)
         found = PlanStatistics(value, goal.T, constraint.T, safe)
-        if limits is None:
-            wanted, all_wanted = None, True
-        else:
+        wanted = None  # all of them
+        if limits is not None:
             allowed = feasible(
                 found,
                 safe_set_threshold=limits.safe_set_threshold.squeeze(-1),
                 constraint_threshold=limits.constraint_threshold,
             )
             wanted = allowed.nonzero().flatten()
-            all_wanted = len(wanted) == r
-        if all_wanted:
+        if wanted is None or len(wanted) == r:
             return found._replace(value=self._value(path[-1]), goal_prob=self._probability("goal", path).mean(1).T)
         if len(wanted):
             kept = path.index_select(2, wanted)

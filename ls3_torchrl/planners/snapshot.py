@@ -18,6 +18,7 @@ from ls3_torchrl.layers import (
     members_of,
     stacked_of,
 )
+from ls3_torchrl.modules.dynamics import EnsembleDynamics
 from ls3_torchrl.planners.latent_env import LatentEnv
 
 
@@ -94,9 +95,10 @@ class Snapshot:
             keep_freed_memory()
         chosen = fastest_precision(device.type) if self._precision == "auto" else self._precision
         self.dtype = torch.bfloat16 if chosen == "bf16" else torch.float32
-        columns = _output_columns(self._env.dynamics).to(device)
+        columns = _output_columns(cast(EnsembleDynamics, self._env.dynamics)).to(device)
         self.stacked = stacked_of(self._env.dynamics.network, self.dtype)
-        self.stacked[-1] = tuple(part.index_select(-1, columns) for part in self.stacked[-1])
+        weight, bias = self.stacked[-1]
+        self.stacked[-1] = weight.index_select(-1, columns), bias.index_select(-1, columns)
         self.members = members_of(self.stacked)
         self.stacked_value = stacked_of(self._value.network, self.dtype)
         self.value = members_of(self.stacked_value)
@@ -105,7 +107,7 @@ class Snapshot:
         return True
 
 
-def _output_columns(dynamics: nn.Module) -> Tensor:
+def _output_columns(dynamics: EnsembleDynamics) -> Tensor:
     """The order in which the dynamics' outputs are kept: of b, log σ and A ``[D, A]``, A's columns before its rows."""
     total = dynamics.network.weights[-1].shape[-1]
     if not dynamics.control_affine:
