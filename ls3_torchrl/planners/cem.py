@@ -224,6 +224,8 @@ class CrossEntropyMethod:
         self, search: _Search, rows: Tensor, any_feasible: Tensor, max_restarts: int, actions: Tensor, fallback: Tensor
     ) -> None:
         """Rows without elites: they start again, or are done when they have done so ``max_restarts`` times."""
+        if any_feasible.all():
+            return
         position = (~any_feasible).nonzero().flatten()
         none = rows[position]
         exhausted = search.restarts[none] >= max_restarts

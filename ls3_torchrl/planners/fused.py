@@ -13,25 +13,20 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from ls3_torchrl._checks import require_choice
-from ls3_torchrl.layers import Precision, run_layers
+from ls3_torchrl.layers import Precision, run_layers, run_stacked
 from ls3_torchrl.planners.fusable import require_fusable, why_not_fused
 from ls3_torchrl.planners.imagination import ImaginationNoise, Limits
 from ls3_torchrl.planners.latent_env import LatentEnv
 from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction, feasible
 from ls3_torchrl.planners.snapshot import Snapshot
+from ls3_torchrl.planners.unrolling import Grouping, group_by_member, unroll
 
 #: Particles that are carried together: their widest layer stays in a core's cache, or fills a GPU.
-_CPU_BLOCK, _GPU_BLOCK = 4096, 262_144
-#: Particles of plans under which a part is not worth a core of its own.
-_SMALLEST_PART = 1024
-#: Members that move particles at one step, each with the particles it moves.
-Groups = list[tuple[int, Tensor]]
+_CPU_BLOCK, _GPU_BLOCK = 5120, 262_144
+#: Particles of plans under which a part is not worth a core: at 500 two cores are as fast as one, at 1000 1.2 times.
+_SMALLEST_PART = 768
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-
-
-def _by_member(members: Tensor) -> Groups:
-    return [(m, (members == m).nonzero().flatten()) for m in members.unique().tolist()]
 
 
 def _take_one_thread() -> None:
@@ -47,12 +42,24 @@ def _side_by_side(job: Callable[[Job], Result], items: Sequence[Job], workers: i
     """Results of ``job`` on each item: whole items on each core, since layers this small gain nothing from sharing."""
     if workers < 2:
         return [job(item) for item in items]
+    left, found = iter(enumerate(items)), {}
+
+    def work() -> None:
+        for i, item in left:
+            found[i] = job(item)
+
     torch.set_num_threads(1)
     try:
-        # One item alone is not handed over: it would only wait for a thread to wake.
-        return [job(items[0])] if len(items) == 1 else list(_pool(workers).map(job, items))
+        # This thread works too: a helper that has to wake first costs a good part of a small plan.
+        helpers = [_pool(workers).submit(work) for _ in range(min(workers, len(items)) - 1)]
+        try:
+            work()
+        finally:
+            for helper in helpers:
+                helper.result()
     finally:
         torch.set_num_threads(workers)
+    return [found[i] for i in range(len(items))]
 
 
 class FusedImagination:
@@ -149,26 +156,26 @@ class FusedImagination:
         parts = self._parts(plans, noise.members.shape[1], workers, on_cpu=on_cpu)
         if compiled and self._compiled_plans is None:
             self._compiled_plans = parts[0].stop
-        # Rows of the batch lie one after another: a part may hold plans of several.
-        row_of = torch.arange(b, device=latent.device).repeat_interleave(n)
         steps = actions.reshape(plans, horizon, -1).transpose(0, 1)
-        groups = [_by_member(members) for members in noise.members] if on_cpu and not compiled else None
+        groups = group_by_member(noise.members) if on_cpu and not compiled else None
+        still = groups is not None and not noise.noise.any()  # then no particle needs its standard deviation
 
         def imagine(part: slice) -> PlanStatistics:
-            rows, first = row_of[part], part.start // n
-            alone = first == (part.stop - 1) // n
-            if noise.noise.shape[3] == 1:
-                drawn = noise.noise[first] if alone else noise.noise[rows, :, :, 0].permute(1, 2, 0, 3)
-            else:
-                drawn = noise.noise.permute(1, 2, 0, 3, 4).flatten(2, 3)[:, :, part]
+            # Rows of the batch lie one after another: a part may hold plans of several.
+            rows, row_of = _rows_of(part, n, latent.device)
+            start, plan = latent[rows], steps[:, part].contiguous()
+            drawn = None if still else _noise_of(noise.noise, rows, row_of, part)
             own = None if limits is None else limits._replace(safe_set_threshold=limits.safe_set_threshold[rows])
-            start = latent[first : first + 1] if alone else latent[rows]
-            plan = steps[:, part].contiguous()
+            if own is not None and row_of is not None:
+                own = own._replace(safe_set_threshold=own.safe_set_threshold[row_of])
+            if compiled and row_of is not None:
+                start, row_of = start[row_of], None  # one shape for all blocks
             if compiled and plan.shape[1] == self._compiled_plans:
                 torch.compiler.cudagraph_mark_step_begin()
                 # Copies, since the next replay writes over what this one returns.
-                return PlanStatistics(*(x.clone() for x in self._replay(start, plan, noise.members, None, drawn, None)))
-            return self._imagine(start, plan, noise.members, groups, drawn, own)
+                args = start, row_of, plan, noise.members, None, drawn, None
+                return PlanStatistics(*(x.clone() for x in self._replay(*args)))
+            return self._imagine(start, row_of, plan, noise.members, groups, drawn, own)
 
         found = _side_by_side(imagine, parts, 1 if compiled else workers)
         return PlanStatistics(*(torch.cat(pieces).unflatten(0, (b, n)) for pieces in zip(*found, strict=True)))
@@ -176,8 +183,11 @@ class FusedImagination:
     def _parts(self, plans: int, particles: int, workers: int, *, on_cpu: bool) -> list[slice]:
         """Plans that are imagined together: as many as a block holds, and no fewer than are worth a core."""
         block = self.block or (_CPU_BLOCK if on_cpu else _GPU_BLOCK)
-        fraction = max(-(-plans // workers), -(-_SMALLEST_PART // particles))
-        size = max(1, min(block // particles, fraction))
+        least = -(-plans // max(1, block // particles))
+        useful = max(1, plans * particles // _SMALLEST_PART)
+        # A multiple of the cores, so that none waits for the others' last block.
+        number = max(least, -(-least // workers) * workers if useful >= workers else 1)
+        size = -(-plans // max(1, min(number, plans)))
         return [slice(start, min(start + size, plans)) for start in range(0, plans, size)]
 
     @cached_property
@@ -188,24 +198,25 @@ class FusedImagination:
     def _imagine(
         self,
         latent: Tensor,
+        row_of: Tensor | None,
         plan: Tensor,
         members: Tensor,
-        groups: list[Groups] | None,
-        noise: Tensor,
+        groups: list[Grouping] | None,
+        noise: Tensor | None,
         limits: Limits | None,
     ) -> PlanStatistics:
-        """Statistics of the plans ``[H, R, A]`` from latents ``[R or 1, D]`` under noise ``[H, P, R or 1, D]``."""
+        """Statistics of the plans ``[H, R, A]``; the arguments are those of ``unroll``, and limits."""
         horizon, r, _ = plan.shape
-        particles, snapshot = noise.shape[1], self._snapshot
-        path = self._unroll(latent, plan, members, groups, noise)
-        violating = torch.stack([self._probability("constraint", states) for states in path], -1)  # [P, R, H]
-        constraint = violating.amax(0) if self.constraint_reduction == "max" else violating.mean(0)
+        path = unroll(self.env.dynamics, self._snapshot, latent, row_of, plan, members, groups, noise)
+        violating = self._probability("constraint", path)
+        constraint = violating.amax(1) if self.constraint_reduction == "max" else violating.mean(1)
         in_safe_set = self._probability("safe_set", path[-1])
         safe = in_safe_set.amin(0) if self.safe_set_reduction == "min" else in_safe_set.mean(0)
 
-        value, goal = latent.new_full((r, len(snapshot.value)), torch.nan), latent.new_full((r, horizon), torch.nan)
-        found = PlanStatistics(value, goal, constraint, safe)
-        wanted = torch.arange(r, device=latent.device)
+        value = latent.new_full((r, len(self._snapshot.value)), torch.nan)
+        goal = latent.new_full((horizon, r), torch.nan)
+        found = PlanStatistics(value, goal.T, constraint.T, safe)
+        wanted = None  # all of them
         if limits is not None:
             allowed = feasible(
                 found,
@@ -213,57 +224,47 @@ class FusedImagination:
                 constraint_threshold=limits.constraint_threshold,
             )
             wanted = allowed.nonzero().flatten()
-        if not len(wanted):
-            return found
-        kept = path if len(wanted) == r else [states[:, wanted] for states in path]
-        goal[wanted] = torch.stack([self._probability("goal", states).mean(0) for states in kept], -1)
-        ends = kept[-1].reshape(-1, kept[-1].shape[-1])
-        values = [run_layers(ends, layers).float().reshape(particles, -1).mean(0) for layers in snapshot.value]
-        value[wanted] = torch.stack(values, -1)
+        if wanted is None or len(wanted) == r:
+            return found._replace(value=self._value(path[-1]), goal_prob=self._probability("goal", path).mean(1).T)
+        if len(wanted):
+            kept = path.index_select(2, wanted)
+            goal[:, wanted] = self._probability("goal", kept).mean(1)
+            value[wanted] = self._value(kept[-1])
         return found
+
+    def _rows_together(self, latent: Tensor) -> int:
+        return self.block or (_CPU_BLOCK if latent.device.type == "cpu" else _GPU_BLOCK)
 
     def _probability(self, head: str, states: Tensor) -> Tensor:
         """Probabilities ``[...]`` by a head of latents ``[..., D]``."""
-        logit = run_layers(states.reshape(-1, states.shape[-1]), self._snapshot.heads[head])
+        rows, layers = states.reshape(-1, states.shape[-1]), self._snapshot.heads[head]
+        pieces = rows.tensor_split(-(-len(rows) // self._rows_together(rows)))
+        logits = [run_layers(piece, layers) for piece in pieces]
+        logit = logits[0] if len(logits) == 1 else torch.cat(logits)
         return logit.float().sigmoid().reshape(states.shape[:-1])
 
-    def _unroll(
-        self, latent: Tensor, plan: Tensor, members: Tensor, groups: list[Groups] | None, noise: Tensor
-    ) -> list[Tensor]:
-        """P particles of every plan ``[H, R, A]``: the latents ``[P, R, D]`` they visit, in layer precision."""
-        dynamics = self.env.dynamics
-        particles, rows = members.shape[1], plan.shape[1]
-        state = latent.expand(particles, rows, -1)
-        path = []
-        for t, action in enumerate(plan):
-            x = dynamics.network_input(state, action.expand(particles, -1, -1)).to(self._snapshot.dtype)
-            output = self._move_together(x, members[t]) if groups is None else self._move_by_member(x, groups[t])
-            delta, log_scale = dynamics.read_output(output.float(), action)
-            delta, log_scale = delta.float(), log_scale.float()  # they are wider where the action's unit is
-            state = torch.addcmul(state + delta, log_scale.exp(), noise[t].expand_as(delta))
-            path.append(state.to(self._snapshot.dtype))
-        return path
+    def _value(self, states: Tensor) -> Tensor:
+        """Every member's value ``[R, M]``, in the mean over the particles, of latents ``[P, R, D]``."""
+        snapshot, rows = self._snapshot, states.reshape(-1, states.shape[-1])
+        members = len(snapshot.value)
+        if len(rows) * members <= self._rows_together(rows):
+            values = run_stacked(rows.expand(members, -1, -1), snapshot.stacked_value)
+        else:
+            values = torch.stack([run_layers(rows, layers) for layers in snapshot.value])
+        return values.float().reshape(members, *states.shape[:-1]).mean(1).T
 
-    def _move_by_member(self, x: Tensor, groups: Groups) -> Tensor:
-        """The dynamics' output for particles ``[P, R, in]``, one member and all of its particles at a time."""
-        output = None
-        for member, which in groups:
-            mine = x[which] if len(groups) > 1 else x
-            moved = run_layers(mine.reshape(-1, x.shape[-1]), self._snapshot.members[member]).reshape(
-                *mine.shape[:-1], -1
-            )
-            if len(groups) == 1:
-                return moved
-            output = moved.new_empty(*x.shape[:-1], moved.shape[-1]) if output is None else output
-            output[which] = moved
-        assert output is not None
-        return output
 
-    def _move_together(self, x: Tensor, member: Tensor) -> Tensor:
-        """The same in batched products with gathered weights: nothing here waits for the device."""
-        last = len(self._snapshot.stacked) - 1
-        for i, (weight, bias) in enumerate(self._snapshot.stacked):
-            x = torch.baddbmm(bias[member], x, weight[member])
-            if i < last:
-                x = x.relu_()
-        return x
+def _rows_of(part: slice, candidates: int, device: torch.device) -> tuple[slice, Tensor | None]:
+    """Rows of the batch that plans of a part belong to, and for each plan which of these; ``None`` where it is one."""
+    first, last = part.start // candidates, (part.stop - 1) // candidates
+    if first == last:
+        return slice(first, last + 1), None
+    return slice(first, last + 1), torch.arange(part.start, part.stop, device=device) // candidates - first
+
+
+def _noise_of(noise: Tensor, rows: slice, row_of: Tensor | None, part: slice) -> Tensor:
+    """Noise ``[H, P, R or 1, D]`` of a part's plans."""
+    if noise.shape[3] > 1:
+        first = part.start - rows.start * noise.shape[3]
+        return noise[rows].permute(1, 2, 0, 3, 4).flatten(2, 3)[:, :, first : first + part.stop - part.start]
+    return noise[rows.start] if row_of is None else noise[rows][row_of, :, :, 0].permute(1, 2, 0, 3)

@@ -9,7 +9,16 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from ls3_torchrl.layers import Layers, Precision, fastest_precision, layers_of, members_of
+from ls3_torchrl.layers import (
+    Layers,
+    Precision,
+    fastest_precision,
+    keep_freed_memory,
+    layers_of,
+    members_of,
+    stacked_of,
+)
+from ls3_torchrl.modules.dynamics import EnsembleDynamics
 from ls3_torchrl.planners.latent_env import LatentEnv
 
 
@@ -24,9 +33,11 @@ class Snapshot:
 
     Attributes:
         dtype: of the layers.
-        members: the dynamics, one member after another.
-        stacked: the dynamics in weights ``[M, in, out]`` and biases ``[M, 1, out]``.
+        members: the dynamics, one member after another. The last layer of control-affine ones writes A's columns one
+            after another, not its rows: ``[A, D]`` numbers that are multiplied by the actions and summed fast.
+        stacked: the same in weights ``[M, in, out]`` and biases ``[M, 1, out]``.
         value: V, one member after another.
+        stacked_value: the same, stacked.
         heads: constraint, goal and safe set.
     """
 
@@ -41,6 +52,7 @@ class Snapshot:
         self.members: list[Layers] = []
         self.stacked: Layers = []
         self.value: list[Layers] = []
+        self.stacked_value: Layers = []
         self.heads: dict[str, Layers] = {}
         self._seen: list[Tensor] = []
 
@@ -79,18 +91,30 @@ class Snapshot:
             return False
         self._require_finite()
         device = parameters[0].device
+        if device.type == "cpu":
+            keep_freed_memory()
         chosen = fastest_precision(device.type) if self._precision == "auto" else self._precision
         self.dtype = torch.bfloat16 if chosen == "bf16" else torch.float32
-        dynamics = self._env.dynamics.network
-        self.members = members_of(dynamics, self.dtype)
-        self.stacked = [
-            (weight.detach().to(self.dtype).clone(), bias.detach().to(self.dtype).clone())
-            for weight, bias in zip(dynamics.weights, dynamics.biases, strict=True)
-        ]
-        self.value = members_of(self._value.network, self.dtype)
+        columns = _output_columns(cast(EnsembleDynamics, self._env.dynamics)).to(device)
+        self.stacked = stacked_of(self._env.dynamics.network, self.dtype)
+        weight, bias = self.stacked[-1]
+        self.stacked[-1] = weight.index_select(-1, columns), bias.index_select(-1, columns)
+        self.members = members_of(self.stacked)
+        self.stacked_value = stacked_of(self._value.network, self.dtype)
+        self.value = members_of(self.stacked_value)
         self.heads = {name: layers_of(cast(nn.Module, head.network), self.dtype) for name, head in self._heads.items()}
         self._seen = [p.detach().clone() for p in parameters]
         return True
+
+
+def _output_columns(dynamics: EnsembleDynamics) -> Tensor:
+    """The order in which the dynamics' outputs are kept: of b, log σ and A ``[D, A]``, A's columns before its rows."""
+    total = dynamics.network.weights[-1].shape[-1]
+    if not dynamics.control_affine:
+        return torch.arange(total)
+    first = 2 * dynamics.latent_dim
+    gain = torch.arange(first, total).reshape(dynamics.latent_dim, dynamics.action_dim)
+    return torch.cat([torch.arange(first), gain.T.flatten()])
 
 
 def _same(one: Tensor, other: Tensor) -> bool:
