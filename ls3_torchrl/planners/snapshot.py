@@ -9,7 +9,8 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from ls3_torchrl.layers import Layers, Precision, fastest_precision, layers_of, members_of
+from ls3_torchrl.layers import Layers, fastest_precision, layers_of, members_of
+from ls3_torchrl.options.planner import Precision
 from ls3_torchrl.planners.latent_env import LatentEnv
 
 
