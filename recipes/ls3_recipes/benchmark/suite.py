@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from torchrl.data import Bounded
 
 import ls3_envs
-from ls3_recipes.algorithms.ls3 import LS3Settings
+from ls3_recipes.algorithms.settings.ls3 import LS3Settings
 from ls3_recipes.benchmark.planning import agreement, time_plans
 from ls3_recipes.benchmark.timing import Bench, matmul_peak, show
 from ls3_recipes.benchmark.updates import time_updates, time_vae
