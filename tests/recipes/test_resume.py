@@ -15,6 +15,7 @@ from ls3_recipes import resume, versions
 from ls3_recipes.algorithms import ls3
 from ls3_recipes.commands.train import main
 from ls3_recipes.configuration import settings_of_run, train_settings
+from ls3_recipes.decided import decided
 from ls3_recipes.options import as_dict
 from ls3_recipes.progress import HeldRandomState, Progress, Worlds
 from ls3_recipes.protocol import Experiment, run_experiment
@@ -22,7 +23,6 @@ from ls3_recipes.resume import begun_with, open_folder
 from ls3_recipes.rollout import collect_demonstrations, make_env
 from ls3_recipes.run_files import read_metrics
 from ls3_recipes.run_folder import AGENTS, RunFolder
-from ls3_recipes.run_settings import decided
 from ls3_torchrl.data import Tag, TaggedReplayBuffer, save_episodes
 
 # TorchRL warns about classes of its own while its collectors are imported.
@@ -184,7 +184,7 @@ def test_what_a_killed_process_had_begun_to_write_is_removed():
 
 def test_what_a_measurement_decides_is_decided_once(monkeypatch):
     fast = {"precision": "bf16"}
-    monkeypatch.setattr("ls3_recipes.run_settings.fastest_precision", lambda _: fast["precision"])
+    monkeypatch.setattr("ls3_recipes.decided.fastest_precision", lambda _: fast["precision"])
     path = begun("output=mine")
     written = settings_of_run(path)
     assert (written.vae.autocast, written.optim.autocast, written.planner.precision) == (True, True, "bf16")
