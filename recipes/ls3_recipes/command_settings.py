@@ -94,9 +94,11 @@ class ReportSettings:
     output: str
 
     def __post_init__(self) -> None:
-        """Take a single folder as a list of one."""
+        """Take a single folder as a list of one, and refuse none."""
         if isinstance(self.runs, str):
             object.__setattr__(self, "runs", (self.runs,))
+        if not self.runs:
+            raise ValueError("No runs: pass runs=[DIR,DIR,...], folders of finished runs.")
         for path in (*self.runs, self.output):
             require_path(path, "output" if path is self.output else "runs")
 

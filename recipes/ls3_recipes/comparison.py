@@ -25,13 +25,11 @@ def report(settings: ReportSettings) -> list[dict[str, str]]:
         The table's rows.
 
     Raises:
-        ValueError: without runs, or for runs that cannot be compared.
+        ValueError: for runs that cannot be compared.
         FileNotFoundError: for a folder of no finished run.
         FileExistsError: when the output folder exists.
     """
     folder = require_new(settings.output)
-    if not settings.runs:
-        raise ValueError("No runs: pass runs=[DIR,DIR,...], folders of finished runs.")
     runs = [read_run(path) for path in settings.runs]
     check_alike(runs)
     rows = rows_of(runs, LABELS)

@@ -211,7 +211,7 @@ def run_command(
     folder = config_dir(options)
 
     def run(chosen: S) -> None:
-        do = job.load(who) if isinstance(job, Job) else job
+        do = job.load() if isinstance(job, Job) else job
         with errors_in_one_line(who, Path(getattr(chosen, "output", None) or "")):
             do(chosen)
 

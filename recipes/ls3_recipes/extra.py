@@ -37,25 +37,23 @@ class Job:
     PyTorch, TorchRL and MuJoCo take seconds to be imported, which neither a help text nor a refusal needs.
 
     Args:
+        who: the command, as it is named where a package is missing.
         address: ``"package.module:name"`` of a function.
 
     Example:
-        >>> Job("math:gcd")(12, 18)
+        >>> Job("ls3 divide", "math:gcd")(12, 18)
         6
     """
 
+    who: str
     address: str
 
-    def load(self, who: str) -> Any:
-        """The function.
-
-        Args:
-            who: the command, as it is named where a package is missing.
-        """
+    def load(self) -> Any:
+        """The function."""
         module, _, name = self.address.partition(":")
-        with remedy_named(who):
+        with remedy_named(self.who):
             return getattr(import_module(module), name)
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         """Call the function."""
-        return self.load(self.address.partition(":")[2])(*args, **options)
+        return self.load()(*args, **options)

@@ -36,13 +36,6 @@ MAY_IMPORT["protocol"] = LOWEST | {"together", "run_settings", "rollout", "plots
 MAY_IMPORT["protocol"] |= {"decided", "interrupts", "offline_data", "progress", "resume", "run_folder", "run_state"}
 MAY_IMPORT["benchmark"] = LOWEST | {"command_settings", "run_settings", "run_files", "run_folder"}
 MAY_IMPORT["benchmark"] |= {"algorithms", "configuration"}
-    "command_settings",
-    "run_settings",
-    "run_files",
-    "run_folder",
-    "algorithms",
-    "configuration",
-}
 MAY_IMPORT["collection"] = LOWEST | {"command_settings", "rollout", "run_files"}
 MAY_IMPORT["comparison"] = LOWEST | {"algorithms", "command_settings", "plots", "run_files"}
 MAY_IMPORT["evaluation"] = LOWEST | {"algorithms", "command_settings", "configuration", "plots", "rollout"}

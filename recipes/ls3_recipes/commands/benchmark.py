@@ -19,7 +19,7 @@ Every figure is a median with its interquartile range; ratios are taken within t
 """
 
 register("benchmark", BenchmarkSettings)
-run_benchmark = Job("ls3_recipes.benchmark.suite:run_benchmark")
+run_benchmark = Job("ls3 benchmark", "ls3_recipes.benchmark.suite:run_benchmark")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -21,7 +21,7 @@ Examples
 
 
 register("collect", CollectSettings)
-collect = Job("ls3_recipes.collection:collect")
+collect = Job("ls3 collect", "ls3_recipes.collection:collect")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

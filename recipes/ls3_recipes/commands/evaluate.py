@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from ls3_recipes.command_settings import EvaluateSettings
-from ls3_recipes.configuration import register, run_command
+from ls3_recipes.configuration import register, run_command, settings_of_run
 from ls3_recipes.extra import Job
 
 HELP = """
@@ -21,10 +21,15 @@ Examples
 """
 
 register("evaluate", EvaluateSettings)
-evaluate = Job("ls3_recipes.evaluation:evaluate")
+evaluate = Job("ls3 evaluate", "ls3_recipes.evaluation:evaluate")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    run_command("evaluate", EvaluateSettings, evaluate, arguments, help_text=HELP)
+    run_command("evaluate", EvaluateSettings, _evaluate, arguments, help_text=HELP)
+
+
+def _evaluate(settings: EvaluateSettings) -> None:
+    settings_of_run(settings.run)  # a folder that holds no run is refused before anything heavy is imported
+    evaluate(settings)

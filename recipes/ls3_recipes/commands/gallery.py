@@ -15,7 +15,7 @@ from ls3_recipes.console import command_line, console
 from ls3_recipes.extra import Job
 from ls3_recipes.run_files import require_writable
 
-plot_gallery = Job("ls3_recipes.plots.gallery:plot_gallery")
+plot_gallery = Job("ls3 gallery", "ls3_recipes.plots.gallery:plot_gallery")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _require_picture(chosen.file)
         except (ValueError, OSError) as error:
             raise SystemExit(f"{who}: {error}") from None
-        plot = plot_gallery.load(who)
+        plot = plot_gallery.load()
         chosen.file.parent.mkdir(parents=True, exist_ok=True)
         console.print(f"The domains are in {plot(chosen.file, chosen.domains)}", markup=False)
 

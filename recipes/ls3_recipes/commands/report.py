@@ -22,7 +22,7 @@ Examples
 
 
 register("report", ReportSettings)
-report = Job("ls3_recipes.comparison:report")
+report = Job("ls3 report", "ls3_recipes.comparison:report")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

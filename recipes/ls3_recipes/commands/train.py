@@ -18,7 +18,7 @@ from ls3_recipes.run_files import is_finished
 from ls3_recipes.run_settings import CHANGEABLE, RunSettings
 from ls3_recipes.typed import typed
 
-run_experiment = Job("ls3_recipes.protocol:run_experiment")
+run_experiment = Job("ls3 train", "ls3_recipes.protocol:run_experiment")
 
 
 def help_text() -> str:
