@@ -24,6 +24,7 @@ from ls3_recipes.rollout import collect_demonstrations, make_env
 from ls3_recipes.run_files import read_metrics
 from ls3_recipes.run_folder import AGENTS, RunFolder
 from ls3_torchrl.data import Tag, TaggedReplayBuffer, save_episodes
+from ls3_torchrl.planners import LS3Planner
 
 # TorchRL warns about classes of its own while its collectors are imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Creating .* which inherits from WeightUpdaterBase:DeprecationWarning")
@@ -316,7 +317,7 @@ def test_an_agent_of_another_name_is_left_alone():
 
 def test_finished_episodes_are_on_the_disk_before_the_next_are_planned(monkeypatch):
     monkeypatch.setattr(ls3, "probe", lambda *_: {})
-    plan, counts = ls3.LS3Planner.forward, []
+    plan, counts = LS3Planner.forward, []
 
     def forward(self, *args, **kwargs):
         counts.append(len(list((experiment[0].folder.path / "episodes").glob("update_*"))))
@@ -326,7 +327,7 @@ def test_finished_episodes_are_on_the_disk_before_the_next_are_planned(monkeypat
 
     def begin(self, *args):
         experiment.append(self)
-        monkeypatch.setattr(ls3.LS3Planner, "forward", forward)
+        monkeypatch.setattr(LS3Planner, "forward", forward)
         return collector(self, *args)
 
     monkeypatch.setattr(Experiment, "_collector", begin)
