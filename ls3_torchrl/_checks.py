@@ -1,4 +1,4 @@
-"""Checks of inputs, with messages that say what was received, what is allowed and what to do."""
+"""Checks of tensors, specs and modules, with messages that say what was received, what is allowed and what to do."""
 
 from __future__ import annotations
 
@@ -9,9 +9,14 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
 
-
-class DataWarning(UserWarning):
-    """Says what was converted in data of one's own, or what looks wrong in them although it may be meant."""
+from ls3_torchrl._values import (  # noqa: F401  (for those who check both)
+    require_at_least,
+    require_choice,
+    require_positive,
+    require_probability,
+    require_unit_interval,
+)
+from ls3_torchrl.exceptions import DataWarning  # noqa: F401
 
 
 def require_keys(tensordict: TensorDictBase, keys: Iterable[NestedKey], who: str) -> None:
@@ -58,42 +63,6 @@ def require_size(value: Tensor, size: int, key: NestedKey, who: str) -> None:
             f"{who} reads {key!r} of shape [*B, {size}], got {list(value.shape)}. Give it what it was made for, or "
             "make it for that size."
         )
-
-
-def require_probability(value: float, name: str) -> float:
-    """Return ``value`` when it lies strictly between 0 and 1; raise ``ValueError`` otherwise."""
-    if not 0.0 < value < 1.0:
-        raise ValueError(f"{name} must lie strictly between 0 and 1 (it is a probability), got {value}.")
-    return float(value)
-
-
-def require_unit_interval(value: float, name: str) -> float:
-    """Return ``value`` when it lies in [0, 1], ends included; raise ``ValueError`` otherwise."""
-    if not 0.0 <= value <= 1.0:
-        raise ValueError(f"{name} must lie in [0, 1], got {value}.")
-    return float(value)
-
-
-def require_choice(value: str, allowed: Iterable[str], name: str) -> str:
-    """Return ``value`` when it is one of ``allowed``; raise ``ValueError`` otherwise."""
-    options = tuple(allowed)
-    if value not in options:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, options))}; got {value!r}.")
-    return value
-
-
-def require_at_least(value: int, low: int, name: str) -> int:
-    """Return ``value`` when it is ``low`` or more; raise ``ValueError`` otherwise."""
-    if value < low:
-        raise ValueError(f"{name} must be at least {low}, got {value}.")
-    return value
-
-
-def require_positive(value: float, name: str) -> float:
-    """Return ``value`` when it is a finite number above 0; raise ``ValueError`` otherwise."""
-    if not 0.0 < value < float("inf"):
-        raise ValueError(f"{name} must be a finite number above 0, got {value}.")
-    return value
 
 
 def action_bounds(spec: TensorSpec) -> tuple[Tensor, Tensor]:

@@ -5,18 +5,17 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
 
-from ls3_torchrl._checks import action_bounds, require_at_least, require_choice
+from ls3_torchrl._checks import action_bounds, require_choice
 from ls3_torchrl.files import load_verified, save_atomically
 from ls3_torchrl.modules import (
     ConstraintEstimator,
@@ -27,6 +26,7 @@ from ls3_torchrl.modules import (
     SafeSet,
     ValueEnsemble,
 )
+from ls3_torchrl.options.agent import AgentArchitecture, plain_of
 from ls3_torchrl.planners import CrossEntropyMethod, LatentEnv, LS3Planner, Optimizer
 
 FORMAT = "ls3_torchrl.agent"
@@ -36,67 +36,9 @@ PARTS = ("encoder", "decoder", "dynamics", "value", "safe_set", "constraint", "g
 _PACKAGES = ("ls3-torchrl", "torch", "torchrl", "tensordict")
 
 
-@dataclass(frozen=True)
-class AgentArchitecture:
-    """The sizes and forms of an agent's networks, stored beside its weights; the paper's by default (section 1.1.1).
-
-    Args:
-        action_dim: A.
-        in_channels: C, 3 × stacked frames.
-        latent_dim: D (Table 1: 32).
-        num_dynamics: members of the dynamics ensemble.
-        num_values: members of the value ensemble.
-        dynamics_hidden: hidden layers of f_dyn.
-        value_hidden: hidden layers of V.
-        classifier_hidden: hidden layers of f_S, f_C and f_G.
-        initial_value: where the value networks' output biases start.
-        propagation: ``"ts1"`` or ``"tsinf"``; see :class:`~ls3_torchrl.modules.EnsembleDynamics`.
-        control_affine: the dynamics' change of the latent is affine in the action.
-        action_scale: unit of the actions in the dynamics, one number or one for each of A. :class:`LS3Agent` also takes
-            ``"box"``, half the range of the actions.
-        background: the decoder draws on top of a fixed image.
-
-    Raises:
-        ValueError: naming the field, what was received and what is allowed.
-    """
-
-    action_dim: int
-    in_channels: int = 3
-    latent_dim: int = 32
-    num_dynamics: int = 5
-    num_values: int = 5
-    dynamics_hidden: tuple[int, ...] = (128, 128)
-    value_hidden: tuple[int, ...] = (256, 256, 256)
-    classifier_hidden: tuple[int, ...] = (256, 256, 256)
-    initial_value: float = 0.0
-    propagation: Literal["ts1", "tsinf"] = "ts1"
-    control_affine: bool = False
-    action_scale: float | tuple[float, ...] = 1.0
-    background: bool = False
-
-    def __post_init__(self) -> None:
-        # Plain numbers and tuples, whatever NumPy or a configuration gave: a file holds nothing else.
-        for field in dataclasses.fields(self):
-            object.__setattr__(self, field.name, _plain(getattr(self, field.name)))
-        for name in ("action_dim", "in_channels", "latent_dim", "num_dynamics", "num_values"):
-            require_at_least(getattr(self, name), 1, name)
-        for name in ("dynamics_hidden", "value_hidden", "classifier_hidden"):
-            object.__setattr__(self, name, tuple(require_at_least(size, 1, name) for size in getattr(self, name)))
-        require_choice(self.propagation, ("ts1", "tsinf"), "propagation")
-
-
-def _plain(value: Any) -> Any:
-    """Numbers and tuples of them instead of those of NumPy, PyTorch or a configuration."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    return (
-        tuple(_plain(item) for item in value) if isinstance(value, Sequence) and not isinstance(value, str) else value
-    )
-
-
 def _storable(name: str, value: Any) -> Any:
     """A setting as a file can hold it."""
-    plain = _plain(value)
+    plain = plain_of(value)
     for item in plain if isinstance(plain, tuple) else (plain,):
         if item is not None and type(item) not in (bool, int, float, str, tuple):
             raise ValueError(
@@ -407,7 +349,7 @@ def _require_dtypes(path: Path, agent: nn.Module, weights: Mapping[str, Any]) ->
 
 
 def _check_shape(path: Path, architecture: dict[str, Any], expected: dict[str, Any]) -> None:
-    wanted = {name: _plain(value) for name, value in expected.items()}
+    wanted = {name: plain_of(value) for name, value in expected.items()}
     there = {name: architecture.get(name) for name in wanted}
     differing = [f"{name} {there[name]} instead of {other}" for name, other in wanted.items() if there[name] != other]
     if differing:

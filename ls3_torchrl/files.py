@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import IO, Any
 from uuid import uuid4
 
-import torch
-
 #: How a file is called that is being written; one that is left was being written when the process ended.
 PARTIAL = ".partial"
 #: Free bytes below which a write that failed is taken for one that found no room.
@@ -32,11 +30,13 @@ def save_atomically(content: Any, path: str | Path) -> Path:
         The path.
 
     Example:
-        >>> import tempfile
+        >>> import tempfile, torch
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     torch.load(save_atomically({"answer": 42}, f"{folder}/new/file.pt"))
         {'answer': 42}
     """
+    import torch  # here: texts, folders and full disks need none of it
+
     return _write_atomically(path, lambda file: torch.save(content, file))
 
 
@@ -121,6 +121,8 @@ def load_verified(path: str | Path, what: str) -> Any:
         ...     load_verified(save_atomically({"answer": 42}, f"{folder}/file.pt"), "an example")
         {'answer': 42}
     """
+    import torch
+
     path = Path(path)
     if not path.is_file():
         there = "it is a folder" if path.is_dir() else "there is no such file"

@@ -13,7 +13,6 @@ from torchrl.modules import MLP
 
 from ls3_torchrl.modules.ensemble import EnsembleMLP
 
-Precision = Literal["auto", "fp32", "bf16"]
 #: A network's layers: weight ``[out, in]`` and bias ``[out]``, ReLU between them.
 Layers = list[tuple[Tensor, Tensor]]
 

@@ -11,16 +11,19 @@ RECIPES = {"ls3_recipes"} | {path.stem for path in (ROOT / "recipes").glob("*.py
 
 # What each part of the library may import of it, besides itself.
 MAY_IMPORT = {
-    "_checks": set(),
+    "_values": set(),
+    "exceptions": set(),
+    "options": {"_values"},
+    "_checks": {"_values", "exceptions"},
     "modules": {"_checks"},
     "objectives": {"_checks", "layers", "modules"},
     "layers": {"_checks", "modules"},
-    "planners": {"_checks", "layers", "modules"},
-    "data": {"_checks", "files", "modules"},
+    "planners": {"_checks", "_values", "layers", "modules", "options"},
+    "data": {"_checks", "exceptions", "files", "modules", "options"},
     "baselines": {"_checks", "modules", "objectives"},
     "files": set(),
-    "agent": {"_checks", "files", "modules", "planners"},
-    "trainers": {"_checks", "agent", "data", "files", "layers", "modules", "objectives"},
+    "agent": {"_checks", "files", "modules", "options", "planners"},
+    "trainers": {"_checks", "agent", "data", "exceptions", "files", "layers", "modules", "objectives", "options"},
     "__init__": {"agent"},
 }
 

@@ -9,8 +9,6 @@ from difflib import get_close_matches
 from functools import partial
 from typing import Any
 
-import torch
-
 
 def whole_number(value: Any, name: str, least: int = 1, unit: str = "") -> int:
     """``value`` as an int, NumPy's whole numbers included.
@@ -30,23 +28,6 @@ def whole_number(value: Any, name: str, least: int = 1, unit: str = "") -> int:
     if number < least:
         raise ValueError(f"{name} must be at least {least}{unit}, got {number}.")
     return number
-
-
-def usable_device(device: torch.device | str) -> torch.device:
-    """The device, after a look at whether this machine has it.
-
-    Raises:
-        ValueError: for a name that PyTorch does not know, or a device that is not there.
-    """
-    try:
-        found = torch.device(device)
-        torch.empty(0, device=found)
-    except (TypeError, RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).partition("\n")[0].rstrip(".")
-        raise ValueError(
-            f"device {device!r} cannot be used here: {reason}. Use device='cpu', or one there is."
-        ) from None
-    return found
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

@@ -12,7 +12,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ls3_envs._checks import usable_device, whole_number
+from ls3_envs._checks import whole_number
+from ls3_envs._devices import usable_device
 from ls3_envs.plane import Plane
 from ls3_envs.seeding import checked_seed, process_id, unused_seed
 

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from ls3_envs._checks import whole_number
 from ls3_envs.base import ACTION_TOLERANCE
+from ls3_envs.making import make
 from ls3_envs.registry import domain as row_of
-from ls3_envs.registry import make
 from ls3_envs.seeding import checked_seed
 
 _FRAMES_PER_SECOND = 20

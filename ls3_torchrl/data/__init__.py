@@ -1,6 +1,5 @@
 """The data path: episodes and their keys, tags, labels, the two-store buffer, augmentation and files."""
 
-from ls3_torchrl._checks import DataWarning
 from ls3_torchrl.data.augment import random_perspective, random_resized_crop
 from ls3_torchrl.data.buffer import TaggedReplayBuffer
 from ls3_torchrl.data.conform import check_datasets
@@ -19,6 +18,7 @@ from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.selection import RowSelection
 from ls3_torchrl.data.stream import BatchStream
 from ls3_torchrl.data.tags import ALL_TAGS, VALUE_TAGS, Tag
+from ls3_torchrl.exceptions import DataWarning
 
 __all__ = [
     "ALL_TAGS",

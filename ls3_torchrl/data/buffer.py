@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer
 
-from ls3_torchrl._checks import DataWarning, require_at_least, require_unit_interval
+from ls3_torchrl._checks import DataWarning, require_at_least
 from ls3_torchrl.data.conform import conform
 from ls3_torchrl.data.encoding import encode_frames
 from ls3_torchrl.data.episode_store import EpisodeStore
@@ -27,6 +27,7 @@ from ls3_torchrl.data.sampler import TagSampler
 from ls3_torchrl.data.selection import RowSelection
 from ls3_torchrl.data.stores import RowStore
 from ls3_torchrl.data.tags import Tag
+from ls3_torchrl.options.buffer import BufferOptions
 
 
 class TaggedReplayBuffer:
@@ -106,14 +107,15 @@ class TaggedReplayBuffer:
     ) -> None:
         # Plain numbers, whatever NumPy gave: a description on disk holds nothing else.
         self.latent_dim = int(require_at_least(latent_dim, 1, "latent_dim"))
-        self.gamma = require_unit_interval(float(gamma), "gamma")
+        BufferOptions(capacity=capacity, gamma=float(gamma), success_tail=success_tail)
+        self.gamma = float(gamma)
         self.continue_failures = bool(continue_failures)
         if self.continue_failures and self.gamma == 1.0:
             raise ValueError(
                 "gamma must be below 1 with continue_failures=True, got 1.0: a failure that goes on for ever would "
                 "return minus infinity. Lower it, for example to 0.99."
             )
-        self.success_tail = None if success_tail is None else int(require_at_least(success_tail, 1, "success_tail"))
+        self.success_tail = None if success_tail is None else int(success_tail)
         self.dynamics_after_violation = dynamics_after_violation
         self.device = torch.device(device)
         self.keys = keys or EpisodeKeys()

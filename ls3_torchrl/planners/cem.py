@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ls3_torchrl._checks import require_at_least
+from ls3_torchrl._values import require_at_least
+from ls3_torchrl.options.planner import CEMOptions
 from ls3_torchrl.planners.optimizer import NoiseSource, Optimizer, OptimizerResult, PlanScores, ScorePlans
 
 
@@ -105,20 +106,17 @@ class CrossEntropyMethod:
         p_constant: float = 0.0,
         min_std: float = 0.0,
     ) -> None:
-        self.num_candidates = require_at_least(num_candidates, 1, "num_candidates")
-        if not 1 <= num_elites <= num_candidates:
-            raise ValueError(f"num_elites must lie between 1 and num_candidates = {num_candidates}, got {num_elites}.")
-        if not 0.0 <= p_random <= 1.0:
-            raise ValueError(f"p_random must lie in [0, 1], got {p_random}.")
-        if not 0.0 <= p_constant <= 1.0 or p_random + p_constant > 1.0:
-            raise ValueError(
-                f"p_constant must lie in [0, 1] and leave room for p_random, got p_constant={p_constant} and "
-                f"p_random={p_random}: together they must not exceed 1."
-            )
-        if not min_std >= 0.0:
-            raise ValueError(f"min_std must not be negative, got {min_std}.")
+        CEMOptions(
+            num_candidates=num_candidates,
+            num_elites=num_elites,
+            optim_steps=optim_steps,
+            p_random=p_random,
+            p_constant=p_constant,
+            min_std=min_std,
+        )
+        self.num_candidates = num_candidates
         self.num_elites = num_elites
-        self.optim_steps = require_at_least(optim_steps, 1, "optim_steps")
+        self.optim_steps = optim_steps
         self.p_random = p_random
         self.p_constant = p_constant
         self.min_std = min_std

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import operator
-from typing import Any, Literal
+from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from ls3_torchrl._checks import require_choice
-from ls3_torchrl.layers import Precision
+from ls3_torchrl.options.planner import ConstraintReduction, EngineName, Precision, SafeSetReduction
 from ls3_torchrl.planners.fusable import require_fusable, why_not_fused
 from ls3_torchrl.planners.fused import FusedImagination
 from ls3_torchrl.planners.imagination import Imagination, RolloutImagination
 from ls3_torchrl.planners.latent_env import LatentEnv
-from ls3_torchrl.planners.scoring import ConstraintReduction, SafeSetReduction
-
-EngineName = Literal["auto", "fused", "rollout"]
 
 
 class Engine:
@@ -49,10 +45,6 @@ class Engine:
         constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
     ) -> None:
-        require_choice(name, ("auto", "fused", "rollout"), "engine")
-        require_choice(precision, ("auto", "fp32", "bf16"), "precision")
-        require_choice(constraint_reduction, ("max", "mean"), "constraint_reduction")
-        require_choice(safe_set_reduction, ("mean", "min"), "safe_set_reduction")
         self.name: EngineName = name
         self._precision: Precision = precision
         self._reductions: dict[str, Any] = {

@@ -13,11 +13,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from ls3_torchrl._checks import require_choice
-from ls3_torchrl.layers import Precision, run_layers, run_stacked
+from ls3_torchrl.layers import run_layers, run_stacked
+from ls3_torchrl.options.planner import ConstraintReduction, Precision, SafeSetReduction
 from ls3_torchrl.planners.fusable import require_fusable, why_not_fused
 from ls3_torchrl.planners.imagination import ImaginationNoise, Limits
 from ls3_torchrl.planners.latent_env import LatentEnv
-from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction, feasible
+from ls3_torchrl.planners.scoring import PlanStatistics, feasible
 from ls3_torchrl.planners.snapshot import Snapshot
 from ls3_torchrl.planners.unrolling import Grouping, group_by_member, unroll
 

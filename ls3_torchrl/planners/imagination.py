@@ -12,8 +12,9 @@ from torch import Tensor
 
 from ls3_torchrl.modules.call import call_on_latent
 from ls3_torchrl.modules.classifiers import probability_of
+from ls3_torchrl.options.planner import ConstraintReduction, SafeSetReduction
 from ls3_torchrl.planners.latent_env import LatentEnv
-from ls3_torchrl.planners.scoring import ConstraintReduction, PlanStatistics, SafeSetReduction
+from ls3_torchrl.planners.scoring import PlanStatistics
 
 
 class ImaginationNoise(NamedTuple):

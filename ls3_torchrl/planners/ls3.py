@@ -13,18 +13,22 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.planners import MPCPlannerBase
 
 from ls3_torchrl._checks import (
-    require_at_least,
-    require_choice,
     require_finite,
     require_keys,
     require_module,
-    require_probability,
 )
-from ls3_torchrl.layers import Precision
 from ls3_torchrl.modules.call import call_on_latent, posterior_keys
+from ls3_torchrl.options.planner import (
+    ConstraintReduction,
+    ControlOptions,
+    EngineName,
+    GoalReduction,
+    Precision,
+    SafeSetReduction,
+)
 from ls3_torchrl.planners.cem import optimizer_or_default
 from ls3_torchrl.planners.decisions import Decisions
-from ls3_torchrl.planners.engine import Engine, EngineName
+from ls3_torchrl.planners.engine import Engine
 from ls3_torchrl.planners.imagination import (
     Imagination,
     ImaginationNoise,
@@ -35,10 +39,7 @@ from ls3_torchrl.planners.imagination import (
 from ls3_torchrl.planners.latent_env import LatentEnv
 from ls3_torchrl.planners.optimizer import Optimizer, OptimizerResult, PlanScores
 from ls3_torchrl.planners.scoring import (
-    ConstraintReduction,
-    GoalReduction,
     PlanStatistics,
-    SafeSetReduction,
     feasible,
     least_harm,
     objective,
@@ -160,17 +161,27 @@ class LS3Planner(MPCPlannerBase):
         super().__init__(model, action_key=action_key)
         self.action_spec = model.full_action_spec[model.action_key]  # also where the model has it under another name
         self.optimizer = optimizer_or_default(optimizer, optimizer_settings, owner=type(self))
-        self.horizon = require_at_least(horizon, 1, "horizon")
-        self.num_particles = require_at_least(num_particles, 1, "num_particles")
-        self.safe_set_threshold = require_probability(safe_set_threshold, "safe_set_threshold")
-        self.constraint_threshold = require_probability(constraint_threshold, "constraint_threshold")
-        self.relaxation = require_probability(relaxation, "relaxation")
-        self.max_relaxations = require_at_least(max_relaxations, 0, "max_relaxations")
-        require_choice(goal_reduction, ("count", "expected"), "goal_reduction")
+        ControlOptions(
+            horizon=horizon,
+            num_particles=num_particles,
+            safe_set_threshold=safe_set_threshold,
+            constraint_threshold=constraint_threshold,
+            relaxation=relaxation,
+            max_relaxations=max_relaxations,
+            constraint_reduction=constraint_reduction,
+            safe_set_reduction=safe_set_reduction,
+            goal_reduction=goal_reduction,
+            pessimism=pessimism,
+            common_noise=common_noise,
+            noise_scale=noise_scale,
+            engine=engine,
+            precision=precision,
+        )
+        self.horizon, self.num_particles = horizon, num_particles
+        self.safe_set_threshold, self.constraint_threshold = float(safe_set_threshold), float(constraint_threshold)
+        self.relaxation, self.max_relaxations = float(relaxation), max_relaxations
         self.goal_reduction: GoalReduction = goal_reduction
-        self.pessimism = _not_negative(pessimism, "pessimism")
-        self.noise_scale = _not_negative(noise_scale, "noise_scale")
-        self.common_noise = common_noise
+        self.pessimism, self.noise_scale, self.common_noise = pessimism, noise_scale, common_noise
         self.value, self.safe_set, self.encoder = value, safe_set, encoder
         self._require_modules()
         self.engine = Engine(
@@ -383,12 +394,6 @@ def _latent_key(encoder: TensorDictModuleBase | None, latent_key: NestedKey) -> 
     if encoder is None or key in {unravel_key(out) for out in encoder.out_keys}:
         return key
     return posterior_keys(encoder)[0]
-
-
-def _not_negative(value: float, name: str) -> float:
-    if not value >= 0.0:
-        raise ValueError(f"{name} must not be negative, got {value}.")
-    return value
 
 
 def _call_once(name: str, head: TensorDictModuleBase, latent: Tensor) -> None:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from ls3_torchrl.options.planner import GoalReduction
 from ls3_torchrl.planners.optimizer import PlanScores
-
-ConstraintReduction = Literal["max", "mean"]
-GoalReduction = Literal["count", "expected"]
-SafeSetReduction = Literal["mean", "min"]
 
 
 class PlanStatistics(NamedTuple):

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from ls3_torchrl.layers import (
     Layers,
-    Precision,
     fastest_precision,
     keep_freed_memory,
     layers_of,
@@ -19,6 +18,7 @@ from ls3_torchrl.layers import (
     stacked_of,
 )
 from ls3_torchrl.modules.dynamics import EnsembleDynamics
+from ls3_torchrl.options.planner import Precision
 from ls3_torchrl.planners.latent_env import LatentEnv
 
 

@@ -1,11 +1,7 @@
 """Training as components, on any environment: the VAE, the latent models, and what they know."""
 
-from ls3_torchrl.trainers.checkpoints import Checkpoints, Stateful
-from ls3_torchrl.trainers.diagnostics import StateProbe
-from ls3_torchrl.trainers.group import LearnerGroup, Stage
-from ls3_torchrl.trainers.learner import AuxiliaryLoss, DivergenceError, Learner
-from ls3_torchrl.trainers.ls3 import LS3Trainer
-from ls3_torchrl.trainers.options import (
+from ls3_torchrl.exceptions import DivergenceError
+from ls3_torchrl.options.training import (
     LossOptions,
     LS3Options,
     OfflineOptions,
@@ -13,6 +9,11 @@ from ls3_torchrl.trainers.options import (
     OptimOptions,
     VAEOptions,
 )
+from ls3_torchrl.trainers.checkpoints import Checkpoints, Stateful
+from ls3_torchrl.trainers.diagnostics import StateProbe
+from ls3_torchrl.trainers.group import LearnerGroup, Stage
+from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner
+from ls3_torchrl.trainers.ls3 import LS3Trainer
 from ls3_torchrl.trainers.vae import VAETrainer
 
 __all__ = [

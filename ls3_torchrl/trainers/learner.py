@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -17,9 +16,10 @@ from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.record.loggers import Logger
 
 from ls3_torchrl.data import BatchStream
+from ls3_torchrl.exceptions import DivergenceError
 from ls3_torchrl.layers import fastest_precision
 from ls3_torchrl.objectives.base import LatentLoss
-from ls3_torchrl.trainers.options import Autocast
+from ls3_torchrl.options.training import Autocast
 from ls3_torchrl.trainers.progress import Bar, progress_bar
 
 #: Gradient steps between logged metrics.
@@ -52,36 +52,6 @@ def log_scalars(logger: Logger | None, phase: str, step: int, scalars: dict[str,
     if logger is not None:
         for name, value in scalars.items():
             logger.log_scalar(f"{phase}/{name}", value, step=step)
-
-
-class DivergenceError(FloatingPointError):
-    """A loss or a gradient is not finite; the networks are as the step before had left them.
-
-    Args:
-        phase: in which it happened.
-        step: gradient steps taken before.
-        scalars: what the losses had written.
-        batch: what they were computed on.
-        remedy: what to do.
-
-    Example:
-        >>> error = DivergenceError("Value", 7, {"loss_value": float("nan")}, None, "Lower its learning rate.")
-        >>> print(error)
-        Value diverged: {'loss_value': nan} at step 7. Lower its learning rate.
-    """
-
-    def __init__(
-        self, phase: str, step: int, scalars: Mapping[str, float], batch: TensorDictBase | None, remedy: str
-    ) -> None:
-        told = not scalars or any(not math.isfinite(value) for value in scalars.values())
-        found = "" if told else ", and its gradient is not finite"
-        super().__init__(f"{phase} diverged: {dict(scalars) or 'not finite'} at step {step}{found}. {remedy}")
-        self.phase, self.step, self.scalars, self.batch = phase, step, dict(scalars), batch
-        self.remedy = remedy
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Copies and pickles are made of the same arguments."""
-        return type(self), (self.phase, self.step, self.scalars, self.batch, self.remedy)
 
 
 def new_seed(generator: torch.Generator | None = None) -> int:

@@ -13,10 +13,11 @@ from torchrl.record.loggers import Logger
 
 from ls3_torchrl.agent import LS3Agent
 from ls3_torchrl.data import TaggedReplayBuffer, random_perspective, random_resized_crop
+from ls3_torchrl.exceptions import DivergenceError
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
+from ls3_torchrl.options.training import VAEOptions
 from ls3_torchrl.trainers.checks import require_actions_of
-from ls3_torchrl.trainers.learner import LOG_INTERVAL, DivergenceError, descend, log_scalars, threads, wants_bf16
-from ls3_torchrl.trainers.options import VAEOptions
+from ls3_torchrl.trainers.learner import LOG_INTERVAL, descend, log_scalars, threads, wants_bf16
 from ls3_torchrl.trainers.progress import progress_bar
 
 _log = logging.getLogger(__name__)

@@ -18,6 +18,7 @@ from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.arguments import config_dir, name_in, split_arguments
 from ls3_recipes.composition import composed, reason
 from ls3_recipes.console import command_line
+from ls3_recipes.extra import Job
 from ls3_recipes.options import build, defaults
 from ls3_recipes.overrides import CONF, GROUPS, check, choices_of
 from ls3_recipes.relevance import prune, refuse_irrelevant, refuse_unread
@@ -25,8 +26,8 @@ from ls3_recipes.renamed import RENAMED, on_command_line, rename_overrides, rena
 from ls3_recipes.run_files import read_yaml
 from ls3_recipes.run_settings import RunSettings
 from ls3_recipes.typed import did_you_mean
+from ls3_torchrl.exceptions import DivergenceError
 from ls3_torchrl.files import is_full
-from ls3_torchrl.trainers import DivergenceError
 
 S = TypeVar("S")
 _HEADING = "All settings, with the values that these arguments give"
@@ -185,7 +186,7 @@ def train_settings(*overrides: str) -> RunSettings:
 def run_command(
     command: str,
     settings: type[S],
-    job: Callable[[S], object],
+    job: Job | Callable[[S], object],
     arguments: Sequence[str],
     *,
     help_text: str,
@@ -196,7 +197,7 @@ def run_command(
     Args:
         command: its name, and that of its file in ``conf/``.
         settings: its class of settings.
-        job: what it does with them.
+        job: what it does with them; a :class:`~ls3_recipes.extra.Job` is imported when they are known to be right.
         arguments: of the command line; Hydra's own options are among them.
         help_text: what stands above the list of settings.
         renamed: present names of its settings by former ones.
@@ -210,8 +211,9 @@ def run_command(
     folder = config_dir(options)
 
     def run(chosen: S) -> None:
+        do = job.load() if isinstance(job, Job) else job
         with errors_in_one_line(who, Path(getattr(chosen, "output", None) or "")):
-            job(chosen)
+            do(chosen)
 
     def under_hydra(config: DictConfig) -> None:
         with errors_in_one_line(who):

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from ls3_torchrl._checks import DataWarning
+from ls3_torchrl.exceptions import DataWarning
 
 console = Console()
 
@@ -36,8 +36,7 @@ def command_line(who: str) -> Iterator[None]:
         if hasattr(stream, "reconfigure") and (stream.encoding or "").lower().replace("-", "") != "utf8":
             stream.reconfigure(errors="replace")
     logger = logging.getLogger("torchrl")
-    level = logger.level
-    logger.setLevel(max(level, logging.WARNING))
+    logger.addFilter(_is_warning)  # a level would be TorchRL's own again as soon as it is imported
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", DataWarning)
@@ -47,7 +46,11 @@ def command_line(who: str) -> Iterator[None]:
         print(f"{who}: {str(stop) or 'stopped by Ctrl-C'}.", file=sys.stderr)
         raise SystemExit(getattr(stop, "exit_code", 130)) from None
     finally:
-        logger.setLevel(level)
+        logger.removeFilter(_is_warning)
+
+
+def _is_warning(record: logging.LogRecord) -> bool:
+    return record.levelno >= logging.WARNING
 
 
 def _show(who: str, other: Any) -> Any:

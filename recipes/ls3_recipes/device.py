@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import platform
-import re
 from pathlib import Path
 
 import torch
 
 from ls3_envs.cores import available_cores
+from ls3_recipes.run_settings import require_device_name
 
 
 def choose_device(name: str) -> torch.device:
@@ -17,8 +17,7 @@ def choose_device(name: str) -> torch.device:
     Raises:
         ValueError: for a device that is not there, or none that is known here.
     """
-    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,4})?", name):
-        raise ValueError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}.")
+    require_device_name(name)
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name.startswith("cuda") and not torch.cuda.is_available():

@@ -10,6 +10,7 @@ from torchrl.collectors import Collector
 
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.console import console, print_summary
+from ls3_recipes.decided import decided
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.figures import Figures, best_update, episode_figures, means_of, summarise
 from ls3_recipes.interrupts import Interrupts
@@ -19,7 +20,7 @@ from ls3_recipes.plots.style import draw
 from ls3_recipes.progress import HeldRandomState, Progress, Worlds
 from ls3_recipes.resume import begun_with, open_folder
 from ls3_recipes.rollout import make_env, run_episodes, tick, whole_episodes
-from ls3_recipes.run_settings import RunSettings, decided
+from ls3_recipes.run_settings import RunSettings
 from ls3_recipes.run_state import RunState
 from ls3_recipes.together import require_room, require_tools
 from ls3_torchrl.data import Tag, load_episodes, save_episodes
@@ -36,7 +37,7 @@ def run_experiment(settings: RunSettings) -> dict:
     """Follow the protocol from demonstrations to pictures, from where the run in the output folder was cut off.
 
     Args:
-        settings: of the run; an instance of its algorithm's ``settings_class``.
+        settings: of the run; an instance of its algorithm's settings.
 
     Returns:
         What is written to ``summary.json``.
@@ -101,7 +102,7 @@ class Experiment:
         self.env = make_env(settings.task, settings.online.episodes_per_update, self.seed["online"], self.device)
         self.horizon: int = self.env.base_env.horizon
         require_tools(settings, self.env.observation_spec["pixels"].shape[-3], self.horizon)
-        self.algorithm = ALGORITHMS[settings.algorithm](settings, self.env, self.device)
+        self.algorithm = ALGORITHMS[settings.algorithm].load()(settings, self.env, self.device)
         self.algorithm.prepare(self.env)
         self.buffer = self.algorithm.make_buffer(self.device)
         self.offline: Offline = {}

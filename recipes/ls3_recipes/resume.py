@@ -13,16 +13,15 @@ from rich.markup import escape
 
 from ls3_recipes.console import console
 from ls3_recipes.options import as_dict
-from ls3_recipes.run_files import read_json, read_yaml, require_new, require_writable
+from ls3_recipes.run_files import is_finished, read_json, read_yaml, require_new, require_writable
 from ls3_recipes.run_folder import RunFolder
 from ls3_recipes.run_settings import RunSettings
 from ls3_recipes.versions import FORMAT, VERSION, description
 
 #: Where runs go that are given no ``output``.
 RUNS = Path("runs")
-#: Settings that say where a run and what it reads lie, and not what it does; some can be changed when it goes on.
+#: Settings that say where a run and what it reads lie, and not what it does.
 _PLACES = ("output", "data", "scratch_dir", "vae.checkpoint", "checkpoint_minutes", "pictures")
-CHANGEABLE = ("data", "scratch_dir", "checkpoint_minutes", "pictures")
 #: What stands for a choice that was made when the run began.
 _OPEN = {
     "device": "auto",
@@ -146,11 +145,6 @@ def require_same_run(path: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
         )
     require_unfinished(path)
     return there
-
-
-def is_finished(path: str | Path) -> bool:
-    """Whether nothing of a run is left to be done."""
-    return (Path(path) / "summary.json").is_file() and not any((Path(path) / "checkpoints").glob("run-*"))
 
 
 def require_unfinished(path: Path) -> None:

@@ -57,6 +57,11 @@ def require_writable(path: str | Path, name: str) -> None:
         raise ValueError(f"{name}={path} cannot be made: the name is too long. Choose a shorter one.")
 
 
+def is_finished(path: str | Path) -> bool:
+    """Whether nothing of a run is left to be done."""
+    return (Path(path) / "summary.json").is_file() and not any((Path(path) / "checkpoints").glob("run-*"))
+
+
 def require_folder(path: str | Path, name: str) -> None:
     """Refuse a folder to work in that is no folder, or that cannot be written to or made.
 

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
+import re
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
-import torch
-
-import ls3_envs
+from ls3_envs.registry import DOMAINS
 from ls3_recipes.options import from_signatures
-from ls3_torchrl._checks import require_at_least, require_choice, require_positive, require_unit_interval
-from ls3_torchrl.agent import AgentArchitecture
-from ls3_torchrl.data import TaggedReplayBuffer
-from ls3_torchrl.layers import fastest_precision
-from ls3_torchrl.trainers import VAEOptions
+from ls3_torchrl._values import require_at_least, require_choice, require_positive
+from ls3_torchrl.options.agent import AgentArchitecture
+from ls3_torchrl.options.buffer import BufferOptions
+from ls3_torchrl.options.training import VAEOptions
 
-S = TypeVar("S", bound="RunSettings")
 #: The parts of a run have seeds of their own, up to ten thousand times as large.
 _LARGEST_SEED = 10**14
+#: Settings that can be changed when a run goes on: where things lie, and not what it does.
+CHANGEABLE = ("data", "scratch_dir", "checkpoint_minutes", "pictures")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +35,7 @@ class TaskSettings:
 
     def __post_init__(self) -> None:
         """Refuse unknown domains and empty episodes."""
-        require_choice(self.name, tuple(ls3_envs.DOMAINS), "name")
+        require_choice(self.name, tuple(DOMAINS), "name")
         for name in ("horizon", "offline_episodes"):
             if getattr(self, name) is not None:
                 require_at_least(getattr(self, name), 1, name)
@@ -96,6 +92,12 @@ def require_threads(threads: int | None) -> None:
         raise ValueError(f"threads must be at least 1, or null for PyTorch's own choice; got {threads}.")
 
 
+def require_device_name(name: str) -> None:
+    """Raise ``ValueError`` for what is no name of a device; whether it is there is seen when it is used."""
+    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,4})?", name):
+        raise ValueError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}.")
+
+
 def _check_architecture(action_scale: Any, **sizes: Any) -> None:
     AgentArchitecture(action_dim=1, **sizes)
     for scale in action_scale if isinstance(action_scale, tuple) else (action_scale,):
@@ -114,20 +116,12 @@ AgentSettings = from_signatures(
 )
 
 
-def check_buffer(capacity: int, gamma: float, success_tail: int | None, **_: bool) -> None:
-    """Raise ``ValueError`` for settings that no replay buffer can have."""
-    require_at_least(capacity, 1, "capacity")
-    require_unit_interval(gamma, "gamma")
-    if success_tail is not None:
-        require_at_least(success_tail, 1, "success_tail")
-
-
 BufferSettings = from_signatures(
     "BufferSettings",
     "The arguments of :class:`~ls3_torchrl.data.TaggedReplayBuffer` that matter to every algorithm.",
-    TaggedReplayBuffer,
-    only=("capacity", "gamma", "success_tail", "dynamics_after_violation"),
-    check=check_buffer,
+    BufferOptions,
+    without=("continue_failures",),
+    check=BufferOptions,
 )
 
 
@@ -187,6 +181,7 @@ class RunSettings:
         require_seed(self.seed)
         for name in ("output", "data", "scratch_dir"):
             require_path(getattr(self, name), name)
+        require_device_name(self.device)
         require_threads(self.threads)
         require_positive(self.checkpoint_minutes, "checkpoint_minutes")
 
@@ -200,31 +195,3 @@ class RunSettings:
     def unread(self) -> dict[str, str]:
         """Sections that nothing reads as the settings are, and the setting that would change that."""
         return {}
-
-
-def decided(settings: S, device: torch.device, begun: Mapping[str, Any]) -> S:
-    """Settings in which nothing is left open: what a measurement or the machine decides is decided once for a run.
-
-    Args:
-        settings: of a run.
-        device: that it computes on.
-        begun: the settings with which it began, if it is continued.
-    """
-    changes: dict[str, Any] = {"device": str(device)}
-    if settings.threads is None:
-        changes["threads"] = begun.get("threads") or torch.get_num_threads()
-    for name in ("data", "scratch_dir"):
-        if (path := getattr(settings, name)) is not None:
-            changes[name] = str(Path(path).absolute())  # it goes on from other folders as well
-    choices = {"vae": "autocast", "optim": "autocast", "planner": "precision"}
-    for name, choice in choices.items():
-        section = getattr(settings, name, None)
-        if getattr(section, choice, None) == "auto":
-            value = begun[name][choice] if begun else _fastest(choice, device)
-            changes[name] = dataclasses.replace(section, **{choice: value})  # type: ignore[type-var]
-    return dataclasses.replace(settings, **changes)
-
-
-def _fastest(choice: str, device: torch.device) -> str | bool:
-    precision = fastest_precision(device.type)
-    return precision if choice == "precision" else precision == "bf16"

@@ -5,9 +5,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import InitTracker, TransformedEnv
 
-from ls3_envs import NavigationDemonstrator, NavigationEnv, NavigationViolator
+from ls3_envs import NavigationDemonstrator, NavigationEnv, NavigationViolator, collect_offline
 from ls3_envs.demonstrators import collect_episodes
-from ls3_envs.registry import collect_offline
 
 
 @pytest.fixture(scope="module")

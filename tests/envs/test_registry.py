@@ -80,7 +80,7 @@ def test_fewer_than_one_frame_are_refused():
 
 def test_more_episodes_than_are_collected_at_once_begin_with_the_same_ones(monkeypatch):
     whole = collect_offline("navigation", "success", episodes=3, seed=4)
-    monkeypatch.setattr("ls3_envs.registry._SIDE_BY_SIDE", 2)
+    monkeypatch.setattr("ls3_envs.making._SIDE_BY_SIDE", 2)
     parts = collect_offline("navigation", "success", episodes=3, seed=4)
     assert parts.batch_size == whole.batch_size
     assert torch.equal(parts["state"][:2, 0], whole["state"][:2, 0])

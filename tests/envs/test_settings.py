@@ -90,7 +90,7 @@ def test_an_unknown_domain_is_answered_with_the_nearest():
     ],
 )
 def test_collections_are_checked_before_anything_is_simulated(options, error, message, monkeypatch):
-    monkeypatch.setattr("ls3_envs.registry.make", lambda *args, **kwargs: pytest.fail("simulated"))
+    monkeypatch.setattr("ls3_envs.making.make", lambda *args, **kwargs: pytest.fail("simulated"))
     with pytest.raises(error, match=message):
         ls3_envs.collect_offline("navigation", **({"kind": "success"} | options))
 

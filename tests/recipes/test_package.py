@@ -8,12 +8,15 @@ import pytest
 PACKAGE = Path(__file__).parents[2] / "recipes" / "ls3_recipes"
 
 # What each part may import of the package, besides itself.
-LOWEST = {"arguments", "options", "renamed", "console", "device", "figures", "typed"}
+LOWEST = {"arguments", "extra", "options", "renamed", "console", "device", "figures", "typed"}
 MAY_IMPORT: dict[str, set[str]] = {part: set() for part in LOWEST}
 MAY_IMPORT["options"] = {"typed"}
+MAY_IMPORT["device"] = {"run_settings"}
 MAY_IMPORT["overrides"] = {"options", "typed"}
 MAY_IMPORT["relevance"] = {"arguments", "options", "run_settings", "algorithms"}
 MAY_IMPORT["run_settings"] = {"options"}
+MAY_IMPORT["decided"] = {"run_settings"}
+MAY_IMPORT["command_settings"] = {"options", "run_settings"}
 MAY_IMPORT |= {part: set() for part in ("progress", "run_files")}
 MAY_IMPORT["versions"] = {"device"}
 MAY_IMPORT["interrupts"] = {"console"}
@@ -30,8 +33,13 @@ MAY_IMPORT["configuration"] = LOWEST | {"composition", "overrides", "relevance"}
 MAY_IMPORT["configuration"] |= {"run_files", "run_settings", "algorithms"}
 MAY_IMPORT["together"] = {"options", "rollout", "run_files", "run_settings"}
 MAY_IMPORT["protocol"] = LOWEST | {"together", "run_settings", "rollout", "plots", "algorithms"}
-MAY_IMPORT["protocol"] |= {"interrupts", "offline_data", "progress", "resume", "run_folder", "run_state"}
-MAY_IMPORT["benchmark"] = LOWEST | {"run_settings", "run_files", "run_folder", "algorithms", "configuration"}
+MAY_IMPORT["protocol"] |= {"decided", "interrupts", "offline_data", "progress", "resume", "run_folder", "run_state"}
+MAY_IMPORT["benchmark"] = LOWEST | {"command_settings", "run_settings", "run_files", "run_folder"}
+MAY_IMPORT["benchmark"] |= {"algorithms", "configuration"}
+MAY_IMPORT["collection"] = LOWEST | {"command_settings", "rollout", "run_files"}
+MAY_IMPORT["comparison"] = LOWEST | {"algorithms", "command_settings", "plots", "run_files"}
+MAY_IMPORT["evaluation"] = LOWEST | {"algorithms", "command_settings", "configuration", "plots", "rollout"}
+MAY_IMPORT["evaluation"] |= {"run_files", "run_folder", "run_settings"}
 MAY_IMPORT["commands"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"commands"}
 MAY_IMPORT["__init__"] = set()

@@ -15,6 +15,7 @@ from ls3_recipes import resume, versions
 from ls3_recipes.algorithms import ls3
 from ls3_recipes.commands.train import main
 from ls3_recipes.configuration import settings_of_run, train_settings
+from ls3_recipes.decided import decided
 from ls3_recipes.options import as_dict
 from ls3_recipes.progress import HeldRandomState, Progress, Worlds
 from ls3_recipes.protocol import Experiment, run_experiment
@@ -22,8 +23,8 @@ from ls3_recipes.resume import begun_with, open_folder
 from ls3_recipes.rollout import collect_demonstrations, make_env
 from ls3_recipes.run_files import read_metrics
 from ls3_recipes.run_folder import AGENTS, RunFolder
-from ls3_recipes.run_settings import decided
 from ls3_torchrl.data import Tag, TaggedReplayBuffer, save_episodes
+from ls3_torchrl.planners import LS3Planner
 
 # TorchRL warns about classes of its own while its collectors are imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Creating .* which inherits from WeightUpdaterBase:DeprecationWarning")
@@ -184,7 +185,7 @@ def test_what_a_killed_process_had_begun_to_write_is_removed():
 
 def test_what_a_measurement_decides_is_decided_once(monkeypatch):
     fast = {"precision": "bf16"}
-    monkeypatch.setattr("ls3_recipes.run_settings.fastest_precision", lambda _: fast["precision"])
+    monkeypatch.setattr("ls3_recipes.decided.fastest_precision", lambda _: fast["precision"])
     path = begun("output=mine")
     written = settings_of_run(path)
     assert (written.vae.autocast, written.optim.autocast, written.planner.precision) == (True, True, "bf16")
@@ -316,7 +317,7 @@ def test_an_agent_of_another_name_is_left_alone():
 
 def test_finished_episodes_are_on_the_disk_before_the_next_are_planned(monkeypatch):
     monkeypatch.setattr(ls3, "probe", lambda *_: {})
-    plan, counts = ls3.LS3Planner.forward, []
+    plan, counts = LS3Planner.forward, []
 
     def forward(self, *args, **kwargs):
         counts.append(len(list((experiment[0].folder.path / "episodes").glob("update_*"))))
@@ -326,7 +327,7 @@ def test_finished_episodes_are_on_the_disk_before_the_next_are_planned(monkeypat
 
     def begin(self, *args):
         experiment.append(self)
-        monkeypatch.setattr(ls3.LS3Planner, "forward", forward)
+        monkeypatch.setattr(LS3Planner, "forward", forward)
         return collector(self, *args)
 
     monkeypatch.setattr(Experiment, "_collector", begin)

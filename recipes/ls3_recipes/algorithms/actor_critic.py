@@ -10,7 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import SACLoss
 
-from ls3_recipes.algorithms.baseline import ActorCriticSettings, Baseline
+from ls3_recipes.algorithms.baseline import Baseline
+from ls3_recipes.algorithms.settings.baselines import ActorCriticSettings
 from ls3_recipes.plots.plane import Field
 from ls3_torchrl.baselines import action_value, gaussian_actor
 from ls3_torchrl.data import Tag

@@ -26,15 +26,13 @@ class Algorithm(ABC):
     Everything that can be wrong with the settings is found in the constructor, before time is spent.
 
     Args:
-        settings: an instance of the class's ``settings_class``.
+        settings: of the class that stands beside it in the table of algorithms.
         env: the environment that it will act in.
         device: of its networks.
     """
 
     #: As in the configuration's ``algorithm``.
     key: ClassVar[str]
-    #: The settings that it has; no other is accepted.
-    settings_class: ClassVar[type[RunSettings]]
     #: How reports show it, by :attr:`name`.
     labels: ClassVar[Mapping[str, Label]]
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import pickle
 import warnings
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -19,12 +18,11 @@ from torchrl.record.loggers import Logger
 
 from ls3_envs import VisualConstraintEnv
 from ls3_recipes.algorithms.base import Algorithm, make_agent
+from ls3_recipes.algorithms.settings.baselines import BaselineSettings
 from ls3_recipes.plots.agent import plot_reconstructions
 from ls3_recipes.plots.plane import Field, maps, over_plane, plane_of
 from ls3_recipes.plots.style import Pictures
-from ls3_recipes.run_settings import RunSettings
 from ls3_torchrl import LS3Agent
-from ls3_torchrl._checks import require_at_least, require_choice, require_positive, require_unit_interval
 from ls3_torchrl.baselines import PixelFeatures, action_bounds
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.files import save_atomically
@@ -33,88 +31,6 @@ from ls3_torchrl.trainers import Learner, LearnerGroup, VAETrainer
 FORMAT = "ls3_torchrl.comparison"
 VERSION = 1
 DEMONSTRATIONS = (Tag.SUCCESS,)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PolicySettings:
-    """The actor of a baseline.
-
-    Args:
-        hidden: hidden layers of every network.
-        lr: Adam's learning rate, above 0.
-        batch_size: transitions in a step.
-        cloning_steps: gradient steps of the actor's mean on the successful demonstrations.
-    """
-
-    hidden: tuple[int, ...] = (256, 256)
-    lr: float = 3.0e-4
-    batch_size: int = 256
-    cloning_steps: int = 5000
-
-    def __post_init__(self) -> None:
-        """Refuse what would only fail after time was spent."""
-        for size in self.hidden:
-            require_at_least(size, 1, "hidden")
-        require_positive(self.lr, "lr")
-        require_at_least(self.batch_size, 1, "batch_size")
-        require_at_least(self.cloning_steps, 0, "cloning_steps")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ActorCriticSettings(PolicySettings):
-    """An actor whose critics learn from penalised rewards.
-
-    Args:
-        penalty: λ, added to the reward of a violation; at most 0.
-        initial_std: of an untrained actor, before squashing.
-        tau: of the lagged critics, in (0, 1]; a value that is wrong for ever sinks by 1 in 1 / tau steps.
-        zero_at_goal: the goal ends the task, whatever happens after.
-        critic_steps: gradient steps offline.
-        updates_per_step: gradient steps online, for each step of the environment.
-    """
-
-    penalty: float
-    initial_std: float = 0.3
-    tau: float = 0.05
-    zero_at_goal: bool = False
-    critic_steps: int = 5000
-    updates_per_step: float = 2.0
-
-    def __post_init__(self) -> None:
-        """Refuse what would only fail after time was spent."""
-        super().__post_init__()
-        if self.penalty > 0.0:
-            raise ValueError(f"penalty is added to the reward of a violation: 0 or below, got {self.penalty}.")
-        require_positive(self.initial_std, "initial_std")
-        require_positive(self.tau, "tau")
-        require_unit_interval(self.tau, "tau")
-        require_at_least(self.critic_steps, 0, "critic_steps")
-        if self.updates_per_step < 0:
-            raise ValueError(f"updates_per_step must be at least 0, got {self.updates_per_step}.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaselineSettings(RunSettings):
-    """What a run of a baseline has, in addition to what every run has.
-
-    Args:
-        encoder: ``"latents"``, the means of the VAE that LS³ trains, frozen; or ``"conv"``, convolutions of each
-            network's own, with which nothing reads ``agent`` and ``vae``.
-        policy: of the actor and, where it has them, its critics.
-    """
-
-    encoder: Literal["latents", "conv"] = "latents"
-    policy: PolicySettings
-
-    def __post_init__(self) -> None:
-        """Refuse unknown encoders."""
-        super().__post_init__()
-        require_choice(self.encoder, ("latents", "conv"), "encoder")
-
-    @property
-    def unread(self) -> dict[str, str]:
-        """Without the VAE, neither its training nor the networks that are made with it."""
-        return dict.fromkeys(("agent", "vae"), "encoder=latents") if self.encoder == "conv" else {}
 
 
 class Baseline(Algorithm):

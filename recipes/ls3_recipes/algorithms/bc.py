@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import nn
 
-from ls3_recipes.algorithms.baseline import Baseline, BaselineSettings
+from ls3_recipes.algorithms.baseline import Baseline
 from ls3_recipes.plots.style import Label
 from ls3_torchrl.baselines import deterministic_actor
 
@@ -16,7 +16,6 @@ class BehaviourCloning(Baseline):
     """The floor under every comparison."""
 
     key = name = "bc"
-    settings_class = BaselineSettings
     labels = {"bc": Label("Behaviour cloning", "#8d99a6")}  # noqa: RUF012
 
     def build(self, build: Callable[..., Any]) -> dict[str, nn.Module]:

@@ -3,121 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from functools import cache
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import Bounded
 from torchrl.envs import TransformedEnv
 from torchrl.record.loggers import Logger
 
 from ls3_recipes.algorithms.base import Algorithm, make_agent
+from ls3_recipes.algorithms.settings.ls3 import LS3Settings
 from ls3_recipes.figures import as_one_shape
-from ls3_recipes.options import as_dict, errors_of, from_signatures
+from ls3_recipes.options import as_dict, errors_of
 from ls3_recipes.plots.agent import pictures_of_agent
 from ls3_recipes.plots.style import Label, Pictures
-from ls3_recipes.run_settings import EpisodeSettings, RunSettings, check_buffer, require_within
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
-from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
-from ls3_torchrl.planners import CrossEntropyMethod, LatentEnv, LS3Planner, describe_plan
+from ls3_torchrl.planners import describe_plan
 from ls3_torchrl.trainers import (
-    LossOptions,
-    LS3Options,
     LS3Trainer,
-    OfflineOptions,
-    OnlineOptions,
-    OptimOptions,
     StateProbe,
     VAETrainer,
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class OnlineSettings(EpisodeSettings, OnlineOptions):
-    """The episodes of online improvement, and the gradient steps of each update."""
-
-    def __post_init__(self) -> None:
-        """Check both."""
-        EpisodeSettings.__post_init__(self)
-        OnlineOptions.__post_init__(self)
-
-
-BufferSettings = from_signatures(
-    "BufferSettings",
-    "The arguments of :class:`~ls3_torchrl.data.TaggedReplayBuffer` that matter to LS³.",
-    TaggedReplayBuffer,
-    only=("capacity", "gamma", "success_tail", "dynamics_after_violation", "continue_failures"),
-    check=check_buffer,
-)
-
-
-@cache
-def _smallest_model() -> tuple[LatentEnv, ValueEnsemble, SafeSet]:
-    """Something to plan with, for no other purpose than to have a planner's settings checked."""
-    with torch.random.fork_rng(devices=[]):
-        spec, hidden = Bounded(low=-1.0, high=1.0, shape=(1,)), (1,)
-        dynamics = EnsembleDynamics(1, 1, num_members=1, hidden=hidden)
-        heads = ConstraintEstimator(1, hidden=hidden), GoalEstimator(1, hidden=hidden)
-        model = LatentEnv(dynamics, *heads, action_spec=spec)
-        return model, ValueEnsemble(1, num_members=1, hidden=hidden), SafeSet(1, hidden=hidden)
-
-
-PlannerSettings = from_signatures(
-    "PlannerSettings",
-    "The options of :class:`~ls3_torchrl.planners.LS3Planner` and of the cross-entropy method.",
-    LS3Planner,
-    CrossEntropyMethod,
-    check=lambda **settings: LS3Planner(*_smallest_model(), **settings),
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LS3Settings(RunSettings):
-    """What a run of LS³ has, in addition to what every run has."""
-
-    buffer: BufferSettings  # type: ignore[valid-type]
-    online: OnlineSettings
-    offline: OfflineOptions
-    optim: OptimOptions
-    loss: LossOptions
-    planner: PlannerSettings  # type: ignore[valid-type]
-
-    def __post_init__(self) -> None:
-        """Refuse what only the sections together are wrong in."""
-        super().__post_init__()
-        if as_dict(self.buffer)["continue_failures"] and as_dict(self.buffer)["gamma"] == 1.0:
-            raise ValueError(
-                "buffer.gamma must be below 1 with buffer.continue_failures=true, got 1.0: a failure that goes on for "
-                "ever would return minus infinity. Lower it, for example to 0.99, or set "
-                "buffer.continue_failures=false and loss.monte_carlo=false."
-            )
-        if self.loss.monte_carlo and not as_dict(self.buffer)["continue_failures"]:
-            raise ValueError(
-                "loss.monte_carlo needs buffer.continue_failures=true: otherwise a failure's return ends with the "
-                "horizon and is no lower bound."
-            )
-
-    def require_horizon(self, steps: int) -> None:
-        """Raise ``ValueError`` for a setting that does not fit episodes of so many steps."""
-        super().require_horizon(steps)
-        require_within(self.loss.dynamics_horizon, steps, "loss.dynamics_horizon")
-        require_within(as_dict(self.planner)["horizon"], steps, "planner.horizon")
-
-    @property
-    def training(self) -> LS3Options:
-        """The settings of the latent models' training."""
-        return LS3Options(offline=self.offline, online=self.online, optim=self.optim, loss=self.loss)
 
 
 class LS3(Algorithm):
     """VAE, latent models and planner, in the paper's order."""
 
     key = name = "ls3"
-    settings_class = LS3Settings
     labels = {"ls3": Label("LS³", "#1b7f79")}  # noqa: RUF012
     needs = (Tag.SUCCESS, Tag.CONSTRAINT)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,79 +13,20 @@ from torchrl.envs import TransformedEnv
 from torchrl.objectives import DDPGLoss, SACLoss
 
 from ls3_recipes.algorithms.actor_critic import ActorCritic
-from ls3_recipes.algorithms.baseline import DEMONSTRATIONS, ActorCriticSettings, BaselineSettings
+from ls3_recipes.algorithms.baseline import DEMONSTRATIONS
+from ls3_recipes.algorithms.settings.baselines import SACfDSettings
 from ls3_recipes.options import as_dict
 from ls3_recipes.plots.plane import Field
 from ls3_recipes.plots.style import Label
-from ls3_torchrl._checks import require_at_least, require_positive, require_unit_interval
 from ls3_torchrl.baselines import RecoveryPolicy, SafetyCritic, SafetyCriticLoss, deterministic_actor
 from ls3_torchrl.data import ALL_TAGS, Tag, TaggedReplayBuffer
 from ls3_torchrl.trainers import Learner, Stage
-
-
-@dataclass(frozen=True, kw_only=True)
-class RiskSettings:
-    """The safety critic of recovery RL (section 1.1.3).
-
-    Args:
-        gamma: γ_risk, in [0, 1].
-        threshold: ε_risk, in [0, 1]: riskier actions are left to the recovery policy.
-        offline_steps: gradient steps on the offline data.
-    """
-
-    gamma: float
-    threshold: float
-    offline_steps: int
-
-    def __post_init__(self) -> None:
-        """Refuse what is no probability."""
-        for name in ("gamma", "threshold"):
-            require_unit_interval(getattr(self, name), name)
-        require_at_least(self.offline_steps, 0, "offline_steps")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SACfDPolicySettings(ActorCriticSettings):
-    """Actor and critics of soft actor-critic.
-
-    Args:
-        alpha: weight of the entropy, for rewards of -1 a step; above 0.
-        learn_alpha: whether it is learnt.
-        risk: of the safety critic, which there is with recovery alone.
-    """
-
-    alpha: float = 0.02
-    learn_alpha: bool = False
-    risk: RiskSettings
-
-    def __post_init__(self) -> None:
-        """Refuse what would only fail after time was spent."""
-        super().__post_init__()
-        require_positive(self.alpha, "alpha")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SACfDSettings(BaselineSettings):
-    """What a run of SACfD has.
-
-    Args:
-        recovery: recovery RL: a safety critic, and a policy that takes over where the task's own is too risky.
-    """
-
-    recovery: bool = False
-    policy: SACfDPolicySettings
-
-    @property
-    def unread(self) -> dict[str, str]:
-        """Without recovery, nothing of the safety critic."""
-        return super().unread | ({} if self.recovery else {"policy.risk": "recovery=true"})
 
 
 class SACfD(ActorCritic):
     """Soft actor-critic that starts from an imitating actor and a critic of the demonstrations."""
 
     key = name = "sacfd"
-    settings_class = SACfDSettings
     labels = {  # noqa: RUF012
         "sacfd_rrl": Label("SACfD+RRL", "#d1495b"),
         "sacfd": Label("SACfD", "#e0a458"),

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import Bounded
 
-from ls3_recipes.algorithms.ls3 import LS3Settings
+from ls3_recipes.algorithms.settings.ls3 import LS3Settings
 from ls3_recipes.benchmark.timing import Bench
 from ls3_recipes.options import as_dict
 from ls3_torchrl import LS3Agent

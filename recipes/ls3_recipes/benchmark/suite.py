@@ -7,7 +7,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,70 +14,20 @@ from tensordict import TensorDictBase
 from torchrl.data import Bounded
 
 import ls3_envs
-from ls3_recipes.algorithms.ls3 import LS3Settings
+from ls3_recipes.algorithms.settings.ls3 import LS3Settings
 from ls3_recipes.benchmark.planning import agreement, time_plans
 from ls3_recipes.benchmark.timing import Bench, matmul_peak, show
 from ls3_recipes.benchmark.updates import time_updates, time_vae
+from ls3_recipes.command_settings import BenchmarkSettings
 from ls3_recipes.configuration import train_settings
 from ls3_recipes.console import console
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.options import as_dict
 from ls3_recipes.run_files import require_new
 from ls3_recipes.run_folder import RunFolder
-from ls3_recipes.run_settings import require_path, require_threads
 from ls3_torchrl import LS3Agent
-from ls3_torchrl._checks import require_at_least, require_choice, require_positive
 from ls3_torchrl.data import Tag, TaggedReplayBuffer
 from ls3_torchrl.trainers.learner import threads
-
-
-@dataclass(frozen=True, kw_only=True)
-class BenchmarkSettings:
-    """What is timed.
-
-    Args:
-        task: whose images and actions.
-        presets: whose planners and updates are timed.
-        domains: whose steps with pixels are timed; all when ``None``.
-        batches: environments planned for at once, and stepped at once.
-        agent: a trained ``agent.pt``, to see what bf16 changes in its plans with each preset's planner.
-        states: images of demonstrations that it plans from.
-        seconds: at least, for each figure.
-        smoke: also time the whole recipe at its smallest.
-        reference: also time the reference, which takes most of the time.
-        device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
-        threads: intra-op threads; ``None`` leaves PyTorch's choice.
-        output: a folder that does not exist yet.
-    """
-
-    task: str = "navigation"
-    presets: tuple[str, ...] = ("cpu", "paper")
-    domains: tuple[str, ...] | None = None
-    batches: tuple[int, ...] = (1, 8, 32)
-    agent: str | None = None
-    states: int = 100
-    seconds: float = 2.0
-    smoke: bool = True
-    reference: bool = True
-    device: str = "auto"
-    threads: int | None = None
-    output: str
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be timed; encoder and buffer are timed at the first preset's sizes."""
-        for name, example in (("presets", "cpu"), ("batches", "1")):
-            if not getattr(self, name):
-                raise ValueError(f"{name} must name at least one, such as {name}=[{example}]; got none.")
-        require_choice(self.task, tuple(ls3_envs.DOMAINS), "task")
-        for domain in self.domains or ():
-            require_choice(domain, tuple(ls3_envs.DOMAINS), "domains")
-        for batch in self.batches:
-            require_at_least(batch, 1, "batches")
-        require_at_least(self.states, 1, "states")
-        require_positive(self.seconds, "seconds")
-        require_threads(self.threads)
-        for name in ("output", "agent"):
-            require_path(getattr(self, name), name)
 
 
 def run_benchmark(settings: BenchmarkSettings) -> dict:

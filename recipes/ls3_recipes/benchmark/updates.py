@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.objectives import HardUpdate
 
-from ls3_recipes.algorithms.ls3 import LS3Settings
+from ls3_recipes.algorithms.settings.ls3 import LS3Settings
 from ls3_recipes.benchmark.reference import ReferenceVAE, reference_members
 from ls3_recipes.benchmark.timing import Bench
 from ls3_recipes.options import as_dict

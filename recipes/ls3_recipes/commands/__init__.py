@@ -6,6 +6,8 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from ls3_recipes.extra import remedy_named
+
 #: What there is, and what it does.
 COMMANDS = {
     "train": "train an agent: demonstrations, offline training, online improvement, evaluation, pictures",
@@ -15,8 +17,6 @@ COMMANDS = {
     "benchmark": "time planning, updates, environments and buffer on this machine",
     "gallery": "draw every domain: a demonstration and a violation",
 }
-#: Packages of the extra without which no command runs.
-EXTRA = ("hydra", "omegaconf", "matplotlib", "PIL", "rich", "tensorboard", "gymnasium", "mujoco", "mujoco_warp", "cv2")
 
 
 def overview() -> str:
@@ -44,6 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         0, or 2 for an unknown command.
+
+    Raises:
+        SystemExit: with one line, where a package is missing; by the command, for what it refuses.
     """
     name, *rest = [*(sys.argv[1:] if arguments is None else arguments)] or ["--help"]
     if name in ("-h", "--help"):
@@ -52,12 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(f"ls3 has no command {name!r}. It has: {', '.join(COMMANDS)}.", file=sys.stderr)
         return 2
-    try:
+    with remedy_named(f"ls3 {name}"):
         command = import_module(f"ls3_recipes.commands.{name}")
-    except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] not in EXTRA:
-            raise
-        print(f"ls3 {name} needs {error.name}: pip install 'ls3-torchrl[recipes]'.", file=sys.stderr)
-        return 1
     command.main(rest)
     return 0

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-import ls3_envs  # noqa: F401  (before TorchRL, which imports MuJoCo: whatever MUJOCO_GL says)
-from ls3_recipes.benchmark.suite import BenchmarkSettings, run_benchmark
+from ls3_recipes.command_settings import BenchmarkSettings
 from ls3_recipes.configuration import register, run_command
+from ls3_recipes.extra import Job
 from ls3_recipes.renamed import RENAMED_OF_BENCHMARK
 
 HELP = """
@@ -19,6 +19,7 @@ Every figure is a median with its interquartile range; ratios are taken within t
 """
 
 register("benchmark", BenchmarkSettings)
+run_benchmark = Job("ls3 benchmark", "ls3_recipes.benchmark.suite:run_benchmark")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -10,10 +10,12 @@ from pathlib import Path
 
 from matplotlib.backend_bases import FigureCanvasBase
 
-import ls3_envs
+from ls3_envs.registry import DOMAINS
 from ls3_recipes.console import command_line, console
-from ls3_recipes.plots.gallery import plot_gallery
+from ls3_recipes.extra import Job
 from ls3_recipes.run_files import require_writable
+
+plot_gallery = Job("ls3 gallery", "ls3_recipes.plots.gallery:plot_gallery")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -22,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "ls3 gallery", description="Draw domains: a demonstration and a violation of each."
     )
     parser.add_argument("file", type=Path, metavar="FILE.png", help="where the picture goes")
-    parser.add_argument("--domains", nargs="+", default=list(ls3_envs.DOMAINS), choices=list(ls3_envs.DOMAINS))
+    parser.add_argument("--domains", nargs="+", default=list(DOMAINS), choices=list(DOMAINS))
     chosen = parser.parse_args(sys.argv[1:] if arguments is None else arguments)
     who = "ls3 gallery"
     with command_line(who):
@@ -30,8 +32,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _require_picture(chosen.file)
         except (ValueError, OSError) as error:
             raise SystemExit(f"{who}: {error}") from None
+        plot = plot_gallery.load()
         chosen.file.parent.mkdir(parents=True, exist_ok=True)
-        console.print(f"The domains are in {plot_gallery(chosen.file, chosen.domains)}", markup=False)
+        console.print(f"The domains are in {plot(chosen.file, chosen.domains)}", markup=False)
 
 
 def _require_picture(path: Path) -> None:

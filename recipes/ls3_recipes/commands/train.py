@@ -9,15 +9,16 @@ from typing import get_type_hints
 
 import yaml
 
-import ls3_envs  # noqa: F401  (before TorchRL, which imports MuJoCo: whatever MUJOCO_GL says)
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.configuration import errors_in_one_line, run_command, settings_class_of, settings_of_run
 from ls3_recipes.console import command_line, console
+from ls3_recipes.extra import Job
 from ls3_recipes.overrides import choices_of
-from ls3_recipes.protocol import run_experiment
-from ls3_recipes.resume import CHANGEABLE, is_finished
-from ls3_recipes.run_settings import RunSettings
+from ls3_recipes.run_files import is_finished
+from ls3_recipes.run_settings import CHANGEABLE, RunSettings
 from ls3_recipes.typed import typed
+
+run_experiment = Job("ls3 train", "ls3_recipes.protocol:run_experiment")
 
 
 def help_text() -> str:

@@ -122,7 +122,7 @@ class Box:
 
 
 def parts(settings, box=None):
-    return ALGORITHMS[settings.algorithm](settings, box or Box(), torch.device("cpu"))
+    return ALGORITHMS[settings.algorithm].load()(settings, box or Box(), torch.device("cpu"))
 
 
 def fill(algorithm, logger, *tags):

@@ -48,10 +48,11 @@ def test_its_file_is_an_agents_that_plans_alike_and_fits_no_other_shape(tmp_path
 
 
 def test_every_algorithm_has_a_name_and_a_colour_for_reports():
-    labels = [label for algorithm in ALGORITHMS.values() for label in algorithm.labels.values()]
+    algorithms = {key: row.load() for key, row in ALGORITHMS.items()}
+    labels = [label for algorithm in algorithms.values() for label in algorithm.labels.values()]
     assert len({label.title for label in labels}) == len({label.colour for label in labels}) == len(labels) == 5
-    assert all(key == algorithm.key for key, algorithm in ALGORITHMS.items())
-    assert all(algorithm.name in algorithm.labels for algorithm in ALGORITHMS.values())
+    assert all(key == algorithm.key for key, algorithm in algorithms.items())
+    assert all(algorithm.name in algorithm.labels for algorithm in algorithms.values())
 
 
 class Reader(torch.nn.Module):

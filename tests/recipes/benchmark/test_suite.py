@@ -10,8 +10,9 @@ from torchrl.data import Bounded
 
 from ls3_recipes.benchmark.planning import agreement, permissive, plan_flops
 from ls3_recipes.benchmark.reference import ReferenceVAE
-from ls3_recipes.benchmark.suite import BenchmarkSettings, run_benchmark
+from ls3_recipes.benchmark.suite import run_benchmark
 from ls3_recipes.benchmark.timing import Bench
+from ls3_recipes.command_settings import BenchmarkSettings
 from ls3_recipes.commands import benchmark as command
 from ls3_recipes.configuration import compose_settings
 from ls3_torchrl import LS3Agent

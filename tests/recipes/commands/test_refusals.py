@@ -5,9 +5,9 @@ import sys
 import pytest
 import torch
 
-from ls3_recipes import offline_data
+from ls3_recipes import collection, offline_data
 from ls3_recipes.benchmark import suite
-from ls3_recipes.commands import collect, main
+from ls3_recipes.commands import main
 from ls3_recipes.protocol import Experiment
 
 TRAIN = ("train", "preset=smoke")
@@ -176,7 +176,7 @@ def at_the_door(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["ls3"])
     monkeypatch.setattr(Experiment, "start", work)
     monkeypatch.setattr(offline_data, "collect_demonstrations", work)
-    monkeypatch.setattr(collect, "collect_demonstrations", work)
+    monkeypatch.setattr(collection, "collect_demonstrations", work)
     monkeypatch.setattr(suite, "matmul_peak", work)
     (tmp_path / "a_file").write_text("precious")
     return tmp_path

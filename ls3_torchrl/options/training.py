@@ -9,7 +9,13 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal
 
-from ls3_torchrl._checks import require_at_least, require_choice, require_positive, require_unit_interval
+from ls3_torchrl._values import (
+    require_at_least,
+    require_choice,
+    require_not_negative,
+    require_positive,
+    require_unit_interval,
+)
 
 Autocast = bool | Literal["auto"]
 #: What can learn from the posteriors' means instead of samples.
@@ -31,8 +37,7 @@ def _require_number(value: float, name: str) -> None:
 
 def _require_not_negative(value: float, name: str) -> None:
     _require_number(value, name)
-    if not value >= 0.0:
-        raise ValueError(f"{name} must not be negative, got {value}.")
+    require_not_negative(value, name)
 
 
 def _require_above_zero(value: float, name: str) -> None:

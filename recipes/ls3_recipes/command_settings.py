@@ -1,0 +1,153 @@
+"""What can be set of the commands beside ``ls3 train``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, make_dataclass
+from typing import Any, get_type_hints
+
+from ls3_envs.registry import DOMAINS
+from ls3_recipes.options import as_dict
+from ls3_recipes.run_settings import TaskSettings, require_device_name, require_path, require_seed, require_threads
+from ls3_torchrl._values import require_at_least, require_choice, require_positive
+from ls3_torchrl.options.planner import PlannerOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectSettings:
+    """What is collected, and where it goes.
+
+    Args:
+        task: whose episodes.
+        seed: of environments and demonstrators.
+        output: a folder that does not exist yet.
+    """
+
+    task: TaskSettings
+    seed: int = 0
+    output: str
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be collected."""
+        require_seed(self.seed)
+        require_path(self.output, "output")
+        if self.task.horizon is not None:
+            raise ValueError(
+                f"task.horizon matters to ls3 train alone, got {self.task.horizon}: offline episodes have the domain's "
+                "own length. Leave it out."
+            )
+
+
+#: Each planner setting in place of the run's, which ``None`` keeps.
+PlannerChanges = make_dataclass(
+    "PlannerChanges",
+    [(name, hint | None, field(default=None)) for name, hint in get_type_hints(PlannerOptions).items()],
+    frozen=True,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateSettings:
+    """What is evaluated, and how.
+
+    Args:
+        run: folder of a finished run.
+        agent: file in it.
+        episodes: side by side.
+        seed: of the environments.
+        device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
+        output: a folder that does not exist yet.
+        planner: settings in place of the run's; for LS³ alone.
+    """
+
+    run: str
+    agent: str = "agent.pt"
+    episodes: int = 20
+    seed: int = 12345
+    device: str = "auto"
+    output: str
+    planner: PlannerChanges = field(default_factory=PlannerChanges)  # type: ignore[valid-type]
+
+    def __post_init__(self) -> None:
+        """Refuse an evaluation of nothing."""
+        require_at_least(self.episodes, 1, "episodes")
+        require_seed(self.seed)
+        require_device_name(self.device)
+        for name in ("run", "agent", "output"):
+            require_path(getattr(self, name), name)
+
+    @property
+    def planner_changes(self) -> dict[str, Any]:
+        """The planner's settings that differ from the run's."""
+        return {name: value for name, value in as_dict(self.planner).items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportSettings:
+    """What is compared, and where it goes.
+
+    Args:
+        runs: folders of finished runs, of any of the algorithms; one alone need not be a list.
+        output: a folder that does not exist yet.
+    """
+
+    runs: tuple[str, ...] | str = ()
+    output: str
+
+    def __post_init__(self) -> None:
+        """Take a single folder as a list of one, and refuse none."""
+        if isinstance(self.runs, str):
+            object.__setattr__(self, "runs", (self.runs,))
+        if not self.runs:
+            raise ValueError("No runs: pass runs=[DIR,DIR,...], folders of finished runs.")
+        for path in (*self.runs, self.output):
+            require_path(path, "output" if path is self.output else "runs")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkSettings:
+    """What is timed.
+
+    Args:
+        task: whose images and actions.
+        presets: whose planners and updates are timed.
+        domains: whose steps with pixels are timed; all when ``None``.
+        batches: environments planned for at once, and stepped at once.
+        agent: a trained ``agent.pt``, to see what bf16 changes in its plans with each preset's planner.
+        states: images of demonstrations that it plans from.
+        seconds: at least, for each figure.
+        smoke: also time the whole recipe at its smallest.
+        reference: also time the reference, which takes most of the time.
+        device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
+        threads: intra-op threads; ``None`` leaves PyTorch's choice.
+        output: a folder that does not exist yet.
+    """
+
+    task: str = "navigation"
+    presets: tuple[str, ...] = ("cpu", "paper")
+    domains: tuple[str, ...] | None = None
+    batches: tuple[int, ...] = (1, 8, 32)
+    agent: str | None = None
+    states: int = 100
+    seconds: float = 2.0
+    smoke: bool = True
+    reference: bool = True
+    device: str = "auto"
+    threads: int | None = None
+    output: str
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be timed; encoder and buffer are timed at the first preset's sizes."""
+        for name, example in (("presets", "cpu"), ("batches", "1")):
+            if not getattr(self, name):
+                raise ValueError(f"{name} must name at least one, such as {name}=[{example}]; got none.")
+        require_choice(self.task, tuple(DOMAINS), "task")
+        for domain in self.domains or ():
+            require_choice(domain, tuple(DOMAINS), "domains")
+        for batch in self.batches:
+            require_at_least(batch, 1, "batches")
+        require_at_least(self.states, 1, "states")
+        require_positive(self.seconds, "seconds")
+        require_device_name(self.device)
+        require_threads(self.threads)
+        for name in ("output", "agent"):
+            require_path(getattr(self, name), name)
