@@ -148,7 +148,7 @@ def require_same_run(path: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def require_unfinished(path: Path) -> None:
-    """Raise ``FileExistsError`` for a run that is finished, or that a version of old left, which kept no state."""
+    """Raise ``FileExistsError`` for a run that is finished, or that another version left, with states of its own."""
     if is_finished(path):
         raise FileExistsError(
             f"The run in {path} is finished, and no run overwrites another. Choose another output=DIR, or move it away."
@@ -156,7 +156,7 @@ def require_unfinished(path: Path) -> None:
     about = read_json(path / "versions.json")
     if (about.get("format"), about.get("version")) != (FORMAT, VERSION):
         raise FileExistsError(
-            f"{path} was left by another version of this program, which kept no state to continue from. "
+            f"{path} was left by another version of this program, whose states this one does not continue. "
             "Choose another output=DIR, or move it away."
         )
 
