@@ -64,14 +64,14 @@ class StateProbe:
         self.error = float((self.read(latent[test]) - state[test]).norm(dim=-1).mean())
 
     def _fit(self, latent: Tensor, state: Tensor, steps: int, generator: torch.Generator, progress: bool) -> None:
-        optimizer = torch.optim.Adam(self._network.parameters(), lr=_LR)
+        optimizer = torch.optim.Adam(self._network.parameters(), lr=_LR, fused=True)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LR, total_steps=steps, pct_start=0.05)
+        seen = (latent - self._latent[0]) / self._latent[1]
         target = (state - self._state[0]) / self._state[1]
         with threads(1), progress_bar(steps, "Probe", enabled=progress) as bar:
             for _ in range(steps):
                 rows = torch.randint(len(latent), (_BATCH,), generator=generator)
-                read = self._network((latent[rows] - self._latent[0]) / self._latent[1])
-                loss = (read - target[rows]).square().mean()
+                loss = (self._network(seen[rows]) - target[rows]).square().mean()
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
