@@ -13,11 +13,13 @@ from torchrl.record.loggers import Logger
 
 from ls3_torchrl.agent import LS3Agent
 from ls3_torchrl.data import TaggedReplayBuffer, random_perspective, random_resized_crop
+from ls3_torchrl.halves import Halves
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
 from ls3_torchrl.trainers.checks import require_actions_of
-from ls3_torchrl.trainers.learner import LOG_INTERVAL, DivergenceError, descend, log_scalars, threads, wants_bf16
+from ls3_torchrl.trainers.learner import LOG_INTERVAL, DivergenceError, is_finite, log_scalars, wants_bf16
 from ls3_torchrl.trainers.options import VAEOptions
 from ls3_torchrl.trainers.progress import progress_bar
+from ls3_torchrl.trainers.vae_gradient import INPUT, TARGET, VAEGradient
 
 _log = logging.getLogger(__name__)
 PHASE = "VAE"
@@ -96,7 +98,6 @@ class VAETrainer:
         for half in (agent.encoder, agent.decoder):
             half.to(memory_format=torch.channels_last)
         self.loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta, reduction=options.reduction)
-        self.loss.set_keys(pixels="vae_input", target="vae_target")
         self._learnt = list(self.loss.parameters())
         self.prediction: LatentPredictionLoss | None = None
         if options.prediction_weight:
@@ -112,6 +113,9 @@ class VAETrainer:
         )
         self.device = next(agent.parameters()).device
         self._bf16 = wants_bf16(options.autocast, self.device)
+        self._gradient = VAEGradient(
+            self.loss, self.prediction, self._learnt, observation=buffer.keys.observation, bf16=self._bf16
+        )
 
     def train(self) -> None:
         """Train what is left of the steps, or take the checkpoint's encoder and decoder; freeze both, encode.
@@ -171,11 +175,11 @@ class VAETrainer:
         if self.steps == 0 and getattr(self.agent.decoder, "background", None) is not None:
             self.agent.decoder.set_background(self.buffer.mean_frame())
         with (
-            threads(options.threads),
+            Halves() as both,
             progress_bar(options.steps, PHASE, done=self.steps, enabled=self.progress) as bar,
         ):
             while self.steps < options.steps:
-                losses = self._step()
+                losses = self._step(both)
                 if self.steps % LOG_INTERVAL == 0 or self.steps == options.steps - 1:
                     scalars = {key: item.item() for key, item in losses.items()}
                     log_scalars(self.logger, PHASE, self.steps, scalars)
@@ -186,20 +190,17 @@ class VAETrainer:
                 if self.after_step is not None:
                     self.after_step()
 
-    def _step(self) -> TensorDictBase:
+    def _step(self, both: Halves) -> TensorDictBase:
         options = self.options
         warmth = warmed_up((self.steps + 1) / options.steps, options.warmup)
         self.loss.beta = options.beta * warmth
         batch = self._sample()
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
-            losses = self.loss(batch)
-            value = losses["loss_vae"]
-            if self.prediction is not None and warmth:
-                losses["prediction"] = self.prediction(batch)["loss_prediction"]
-                value = value + warmth * options.prediction_weight * losses["prediction"]
-        if not descend(self.optimizer, self._learnt, value):
+        noise = torch.randn(options.batch_size, self.buffer.latent_dim, device=self.device)
+        losses, value = self._gradient(batch, noise, warmth * options.prediction_weight, both)
+        if not is_finite(self._learnt, value):
             scalars = {key: item.item() for key, item in losses.items()}
             raise DivergenceError(PHASE, self.steps, scalars, batch, "Lower VAEOptions.lr.")
+        self.optimizer.step()
         self.schedule.step()
         return losses
 
@@ -215,9 +216,12 @@ class VAETrainer:
                 options.batch_size, without=left_out, steps=steps if steps > 1 else None
             )
         batch = batch.to(self.device)
-        target = batch["vae_target"] = self._enlarge(batch[self.buffer.keys.observation])
-        crop = options.crop_scale
-        batch["vae_input"] = target if crop is None else random_resized_crop(target, scale=crop)
+        images = batch.get(self.buffer.keys.observation)
+        target = self._enlarge(images)
+        if target is not images:
+            batch.set(TARGET, target)
+        if options.crop_scale is not None:
+            batch.set(INPUT, random_resized_crop(target, scale=options.crop_scale))
         return batch
 
     def _enlarge(self, pixels: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModule
 
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import EpisodeKeys, TaggedReplayBuffer
+from ls3_torchrl.halves import Halves
 from ls3_torchrl.objectives import VAELoss
 from ls3_torchrl.trainers import DivergenceError, VAEOptions, VAETrainer
 
@@ -141,14 +142,12 @@ def test_training_that_continues_from_its_state_ends_as_one_that_was_never_stopp
         return VAETrainer(make_agent(), filled(content), VAEOptions(steps=6, **settings), progress=False)
 
     whole, first, second = trainer(0), trainer(0), trainer(1)
-    torch.manual_seed(3)
-    for _ in range(6):
-        whole._step()
-        whole.steps += 1
-    torch.manual_seed(3)
-    for _ in range(4):
-        first._step()
-        first.steps += 1
+    for one, steps in ((whole, 6), (first, 4)):
+        torch.manual_seed(3)
+        with Halves() as both:
+            for _ in range(steps):
+                one._step(both)
+                one.steps += 1
     second.load_state_dict(first.state_dict())
     second._minimise()
     assert second.steps == 6
