@@ -70,7 +70,7 @@ class _ConvolutionalPosterior(nn.Module):
             nn.ReLU(inplace=True),
             nn.Conv2d(32, 64, 4, stride=3),
             nn.ReLU(inplace=True),
-            nn.Conv2d(64, 128, 4, stride=2),
+            FastConv2d(64, 128, 4, stride=2),
             nn.ReLU(inplace=True),
             FastConv2d(128, _FEATURES, 4, stride=2),
             nn.ReLU(inplace=True),

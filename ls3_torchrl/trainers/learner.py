@@ -109,7 +109,7 @@ def set_gradients(parameters: Iterable[Parameter], value: Tensor) -> bool:
     return is_finite(parameters, value)
 
 
-def is_finite(parameters: Iterable[Parameter], value: Tensor) -> bool:
+def is_finite(parameters: Iterable[Tensor], value: Tensor) -> bool:
     """Whether a loss and the square of its gradient are finite."""
     # NaN and infinity outlast a norm, which is cheaper than a look at every entry.
     norm = get_total_norm([parameter.grad for parameter in parameters if parameter.grad is not None])

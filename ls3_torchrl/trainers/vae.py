@@ -105,16 +105,16 @@ class VAETrainer:
             keys = buffer.keys
             self.prediction.set_keys(pixels=keys.observation, action=keys.action, next_pixels=keys.next_observation)
             self._learnt += agent.dynamics.parameters()
-        self.optimizer = torch.optim.Adam(self._learnt, lr=options.lr, fused=True)
-        self.schedule: torch.optim.lr_scheduler.LRScheduler = (
-            torch.optim.lr_scheduler.OneCycleLR(self.optimizer, options.lr, total_steps=options.steps, pct_start=0.1)
-            if options.schedule == "onecycle"
-            else torch.optim.lr_scheduler.ConstantLR(self.optimizer, factor=1.0)
-        )
         self.device = next(agent.parameters()).device
         self._bf16 = wants_bf16(options.autocast, self.device)
         self._gradient = VAEGradient(
             self.loss, self.prediction, self._learnt, observation=buffer.keys.observation, bf16=self._bf16
+        )
+        self.optimizer = torch.optim.Adam(self._gradient.leaves, lr=options.lr, fused=True)
+        self.schedule: torch.optim.lr_scheduler.LRScheduler = (
+            torch.optim.lr_scheduler.OneCycleLR(self.optimizer, options.lr, total_steps=options.steps, pct_start=0.1)
+            if options.schedule == "onecycle"
+            else torch.optim.lr_scheduler.ConstantLR(self.optimizer, factor=1.0)
         )
 
     def train(self) -> None:
@@ -197,7 +197,7 @@ class VAETrainer:
         batch = self._sample()
         noise = torch.randn(options.batch_size, self.buffer.latent_dim, device=self.device)
         losses, value = self._gradient(batch, noise, warmth * options.prediction_weight, both)
-        if not is_finite(self._learnt, value):
+        if not is_finite(self._gradient.leaves, value):
             scalars = {key: item.item() for key, item in losses.items()}
             raise DivergenceError(PHASE, self.steps, scalars, batch, "Lower VAEOptions.lr.")
         self.optimizer.step()

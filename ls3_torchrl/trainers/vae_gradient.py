@@ -48,7 +48,9 @@ class VAEGradient:
     ) -> None:
         self.loss, self.prediction, self.parameters = loss, prediction, list(parameters)
         self.observation, self.bf16 = observation, bf16
-        self._sums = [torch.zeros_like(parameter) for parameter in self.parameters]
+        #: The parameters' values, shared with them, in an order that suits an optimiser; they get the gradients.
+        self.leaves = [in_memory_order(parameter) for parameter in self.parameters]
+        self._sums = [torch.zeros_like(leaf) for leaf in self.leaves]
 
     def __call__(
         self, batch: TensorDictBase, noise: Tensor, weight: float, both: Halves
@@ -64,14 +66,13 @@ class VAEGradient:
         size = len(noise)
         if size < 2 or not self._can_be_halved():
             values, gradients = self._part(batch, noise, weight, 1.0)
-            for parameter, gradient in zip(self.parameters, gradients, strict=True):
-                parameter.grad = gradient
+            self._write(gradients)
         else:
             middle = size // 2
             ends = ((0, middle), (middle, size))
             parts = [(batch[start:end], noise[start:end], weight, (end - start) / size) for start, end in ends]
             first, second = both(lambda: self._part(*parts[0]), lambda: self._part(*parts[1]))
-            self._add(first[1], second[1])
+            self._write(first[1], second[1])
             values = {name: value + second[0][name] for name, value in first[0].items()}
         value = values.pop("sum")
         return TensorDict(values), value
@@ -127,9 +128,20 @@ class VAEGradient:
             return encoder.of_pixels(images)
         return encode(encoder, TensorDict({}, [len(images)]).set(encoder.in_keys[0], images))
 
-    def _add(self, first: Iterable[Tensor | None], second: Iterable[Tensor | None]) -> None:
-        """Sum the halves' gradients, in the parameters' order of memory."""
-        for parameter, total, one, other in zip(self.parameters, self._sums, first, second, strict=True):
-            parameter.grad = None
-            if one is not None and other is not None:
-                parameter.grad = torch.add(one, other, out=total)
+    def _write(self, *parts: Iterable[Tensor | None]) -> None:
+        """Sum the gradients of all parts."""
+        for leaf, total, *found in zip(self.leaves, self._sums, *parts, strict=True):
+            gradients = [in_memory_order(one) for one in found if one is not None]
+            leaf.grad = None
+            if len(gradients) == 1:
+                leaf.grad = total.copy_(gradients[0])
+            elif gradients:
+                leaf.grad = torch.add(*gradients, out=total)
+
+
+def in_memory_order(tensor: Tensor) -> Tensor:
+    """A tensor itself, or, of weights kept channels last, a view in the order of their memory.
+
+    PyTorch's fused Adam copies what lies in another order to and fro.
+    """
+    return tensor.detach() if tensor.ndim != 4 else tensor.detach().permute(0, 2, 3, 1)
