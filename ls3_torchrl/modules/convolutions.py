@@ -31,12 +31,10 @@ class _Product(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(rows: Tensor, weight: Tensor, dtype: torch.dtype) -> Tensor:
-        return rows.to(dtype) @ weight.to(dtype)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, torch.dtype], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs[:2])
+    def forward(ctx: Any, rows: Tensor, weight: Tensor, dtype: torch.dtype) -> Tensor:
+        computed, ctx.dtypes = (rows.to(dtype), weight.to(dtype)), (rows.dtype, weight.dtype)
+        ctx.save_for_backward(*computed)
+        return computed[0] @ computed[1]
 
     @staticmethod
     @once_differentiable
@@ -44,9 +42,11 @@ class _Product(torch.autograd.Function):
         rows, weight = ctx.saved_tensors
         of_rows = of_weight = None
         if ctx.needs_input_grad[0]:
-            of_rows = (gradient @ weight.to(gradient.dtype).T).to(rows.dtype)
+            of_rows = (gradient @ weight.T).to(ctx.dtypes[0])
         if ctx.needs_input_grad[1]:
-            of_weight = rows.to(weight.dtype).T @ gradient.to(weight.dtype)
+            left, right = (x.to(ctx.dtypes[1]) for x in (rows, gradient))
+            # In the weight's order of memory.
+            of_weight = left.T @ right if weight.is_contiguous() else (right.T @ left).T
         return of_rows, of_weight, None
 
 
