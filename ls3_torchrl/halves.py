@@ -11,6 +11,19 @@ import torch
 _T = TypeVar("_T")
 
 
+#: Bytes, the largest block after whose release the GNU allocator keeps what is freed (32 MiB, less its own header).
+_LARGEST_KEPT = 2**25 - 2**16
+
+
+def _keep_freed_memory() -> None:
+    """Let the allocator keep freed memory for the next step, up to twice the largest block that was ever freed.
+
+    Otherwise it is given back after every step, and got again page by page, a sixth of the time of a small step. The
+    block is never written to, and takes up no memory.
+    """
+    torch.empty(_LARGEST_KEPT, dtype=torch.uint8)
+
+
 class Halves:
     """Carries out two computations at a time, each on half of the cores; on a single core one after the other.
 
@@ -30,6 +43,7 @@ class Halves:
         self._cores = 0
 
     def __enter__(self) -> Self:
+        _keep_freed_memory()
         self._cores = torch.get_num_threads()
         half = max(1, self._cores // 2)
         torch.set_num_threads(half)

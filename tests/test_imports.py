@@ -16,11 +16,12 @@ MAY_IMPORT = {
     "objectives": {"_checks", "modules"},
     "layers": {"_checks", "modules"},
     "planners": {"_checks", "layers", "modules"},
-    "data": {"_checks", "files", "modules"},
+    "data": {"_checks", "files", "halves", "modules"},
     "baselines": {"_checks", "modules", "objectives"},
     "files": set(),
+    "halves": set(),
     "agent": {"_checks", "files", "modules", "planners"},
-    "trainers": {"_checks", "agent", "data", "files", "layers", "modules", "objectives"},
+    "trainers": {"_checks", "agent", "data", "files", "halves", "layers", "modules", "objectives"},
     "__init__": {"agent"},
 }
 

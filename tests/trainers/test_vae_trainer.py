@@ -4,7 +4,6 @@ import copy
 
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from ls3_torchrl import LS3Agent
@@ -100,11 +99,13 @@ def test_prediction_leaves_out_what_follows_a_violation_where_the_buffer_says_so
     ("warmup", "fractions"),
     [(None, [1.0, 1.0, 1.0, 1.0]), ([0.0, 0.75], [1 / 3, 2 / 3, 1.0, 1.0]), ([0.25, 0.75], [0.0, 0.5, 1.0, 1.0])],
 )
-def test_beta_rises_over_its_fraction_of_the_steps(make_agent, filled, monkeypatch, warmup, fractions):
-    seen, forward = [], VAELoss.forward
-    monkeypatch.setattr(VAELoss, "forward", lambda self, td: (seen.append(self.beta), forward(self, td))[1])
+def test_beta_rises_over_its_fraction_of_the_steps(make_agent, filled, warmup, fractions):
+    seen = []
     options = VAEOptions(**(FAST | {"steps": 4}), beta=0.3, warmup=warmup)
-    VAETrainer(make_agent(), filled(), options, progress=False).train()
+    trainer = VAETrainer(
+        make_agent(), filled(), options, progress=False, after_step=lambda: seen.append(trainer.loss.beta)
+    )
+    trainer._minimise()
     assert seen == pytest.approx([0.3 * fraction for fraction in fractions])
 
 
@@ -251,10 +252,19 @@ def test_an_encoder_without_a_decoder_needs_no_training():
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(make_agent, filled, monkeypatch):
-    nothing = {"loss_vae": torch.tensor(torch.nan, requires_grad=True), "reconstruction": torch.tensor(0.0)}
-    monkeypatch.setattr(VAELoss, "forward", lambda self, td: TensorDict(nothing))
-    with pytest.raises(FloatingPointError, match="VAE diverged"):
-        VAETrainer(make_agent(), filled(), VAEOptions(**FAST), progress=False).train()
+    found = VAELoss.of_posterior
+
+    def not_finite(self, loc, scale, target, *, noise):
+        values = found(self, loc, scale, target, noise=noise)
+        return values | {"loss_vae": values["loss_vae"] * torch.nan}
+
+    monkeypatch.setattr(VAELoss, "of_posterior", not_finite)
+    trainer = VAETrainer(make_agent(), filled(), VAEOptions(**FAST), progress=False)
+    before = {key: value.clone() for key, value in trainer.agent.state_dict().items()}
+    with pytest.raises(FloatingPointError, match=r"VAE diverged: .*'loss_vae': nan") as raised:
+        trainer.train()
+    assert raised.value.batch["pixels"].shape == (4, 3, 64, 64)
+    assert all(torch.equal(value, before[key]) for key, value in trainer.agent.state_dict().items())
 
 
 def test_it_can_be_taken_back_to_an_earlier_state(make_agent, filled):
