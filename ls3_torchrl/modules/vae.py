@@ -90,8 +90,9 @@ class _ConvolutionalPosterior(nn.Module):
                 "= 3 x stacked frames."
             )
         dtype = computed = self.head.weight.dtype
+        # The first convolution would round them to autocast's dtype; to divide in it gives the same.
         if pixels.device.type == "cpu" and pixels.dtype == torch.uint8 and torch.is_autocast_enabled("cpu"):
-            computed = torch.get_autocast_dtype("cpu")  # to which the first convolution would round them, as they are here
+            computed = torch.get_autocast_dtype("cpu")
         images = as_unit_pixels(pixels, computed)
         if pixels.is_floating_point():
             _require_unit_range(pixels)

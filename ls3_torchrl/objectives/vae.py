@@ -9,6 +9,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torch.distributions import Normal
 from torch.nn.functional import mse_loss
 
 from ls3_torchrl._checks import require_choice
@@ -105,8 +106,8 @@ class VAELoss(LatentLoss):
             target: the images, floats in [0, 1] ``[B, C, 64, 64]``.
             noise: standard normal ``[B, D]``, of which z is made; drawn when ``None``.
         """
-        noise = torch.randn_like(loc) if noise is None else noise
-        reconstruction = call_on_latent(self.decoder, loc + scale * noise)
+        latent = Normal(loc, scale).rsample() if noise is None else loc + scale * noise
+        reconstruction = call_on_latent(self.decoder, latent)
         if reconstruction.shape != target.shape:
             raise ValueError(
                 f"The decoder writes images of shape {list(reconstruction.shape)} where the images to reconstruct have "
