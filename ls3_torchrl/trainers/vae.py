@@ -19,7 +19,7 @@ from ls3_torchrl.trainers.checks import require_actions_of
 from ls3_torchrl.trainers.learner import LOG_INTERVAL, DivergenceError, is_finite, log_scalars, wants_bf16
 from ls3_torchrl.trainers.options import VAEOptions
 from ls3_torchrl.trainers.progress import progress_bar
-from ls3_torchrl.trainers.vae_gradient import INPUT, TARGET, VAEGradient
+from ls3_torchrl.trainers.vae_gradient import INPUT, TARGET, VAEGradient, in_channel_order, in_memory_order, reordered
 
 _log = logging.getLogger(__name__)
 PHASE = "VAE"
@@ -252,7 +252,7 @@ class VAETrainer:
         return {
             "loss": self.loss.state_dict(),
             "dynamics": self.agent.dynamics.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": reordered(self.optimizer.state_dict(), in_channel_order),
             "schedule": self.schedule.state_dict(),
             "steps": self.steps,
             "error": self._error,
@@ -267,7 +267,9 @@ class VAETrainer:
         for parameter in self._learnt:
             parameter.requires_grad_(True)  # it may have been frozen meanwhile
         self.agent.dynamics.load_state_dict(state_dict["dynamics"])
-        self.optimizer.load_state_dict(state_dict["optimizer"])
+        # Contiguous, which the fused Adam takes them to be.
+        ordered = reordered(state_dict["optimizer"], lambda value: in_memory_order(value).contiguous())
+        self.optimizer.load_state_dict(ordered)
         self.schedule.load_state_dict(state_dict["schedule"])
         self.steps, self._error = state_dict["steps"], state_dict["error"]
         self._checked, self._rescaled = state_dict["checked"], state_dict["rescaled"]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -145,3 +146,14 @@ def in_memory_order(tensor: Tensor) -> Tensor:
     PyTorch's fused Adam copies what lies in another order to and fro.
     """
     return tensor.detach() if tensor.ndim != 4 else tensor.detach().permute(0, 2, 3, 1)
+
+
+def in_channel_order(tensor: Tensor) -> Tensor:
+    """The reverse of :func:`in_memory_order`."""
+    return tensor if tensor.ndim != 4 else tensor.permute(0, 3, 1, 2)
+
+
+def reordered(state: dict[str, Any], order: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+    """An optimiser's state with its tensors in another order: files hold them in that of the weights' shapes."""
+    averages = {index: {name: order(value) for name, value in of.items()} for index, of in state["state"].items()}
+    return {**state, "state": averages}

@@ -1,6 +1,7 @@
 """The VAE's training: what encoder and decoder learn from, what is said when they learn nothing, how it continues."""
 
 import copy
+import threading
 
 import pytest
 import torch
@@ -188,6 +189,37 @@ def test_training_that_was_stopped_at_a_step_ends_as_one_that_was_not(make_agent
         pairs = zip(getattr(whole.agent, half).parameters(), getattr(second.agent, half).parameters(), strict=True)
         assert all(torch.equal(a, b) for a, b in pairs), half
     assert torch.equal(second.buffer.transitions.storage[:]["loc"], whole.buffer.transitions.storage[:]["loc"])
+
+
+def test_the_optimisers_state_has_the_shapes_of_the_weights_and_continues_from_any_order_of_memory(make_agent, filled):
+    trainer = VAETrainer(make_agent(), filled(), VAEOptions(**FAST), progress=False)
+    trainer.train()
+    state = trainer.state_dict()
+    averages = [state["optimizer"]["state"][i] for i in range(len(trainer._learnt))]
+    assert all(of["exp_avg"].shape == p.shape for of, p in zip(averages, trainer._learnt, strict=True))
+    kept = [of["exp_avg"].clone() for of in averages]
+    for of in averages:
+        of["exp_avg"] = of["exp_avg"].contiguous()
+    trainer.load_state_dict(state)
+    again = trainer.state_dict()["optimizer"]["state"]
+    assert all(torch.equal(again[i]["exp_avg"], average) for i, average in enumerate(kept))
+    assert all(of["exp_avg"].is_contiguous() for of in trainer.optimizer.state.values())
+
+
+def test_after_a_step_that_raises_no_thread_is_left(make_agent, filled):
+    def stop():
+        assert torch.get_num_threads() == 1
+        raise KeyboardInterrupt
+
+    before, began = torch.get_num_threads(), threading.active_count()
+    torch.set_num_threads(2)
+    try:
+        trainer = VAETrainer(make_agent(), filled(), VAEOptions(**FAST), progress=False, after_step=stop)
+        with pytest.raises(KeyboardInterrupt):
+            trainer.train()
+        assert (torch.get_num_threads(), threading.active_count()) == (2, began)
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_training_again_once_it_has_ended_changes_nothing(make_agent, filled, episode):
