@@ -105,17 +105,6 @@ def relu_(x: Tensor) -> Tensor:
     return x.relu_()
 
 
-@lru_cache(maxsize=1)
-def keep_freed_memory() -> None:
-    """Have the allocator keep the memory of freed layers for the next ones: once a process, and free of charge.
-
-    glibc gives freed blocks back to the system, to fetch them again page by page, unless it has seen a larger block
-    come and go; then it keeps up to twice that much. Without it a plan at paper sizes may spend a third of its time on
-    pages. Up to 32 MiB count; other allocators are not moved by it. None of these pages is ever touched.
-    """
-    torch.empty(31 << 20, dtype=torch.uint8)
-
-
 @lru_cache(maxsize=4)
 def fastest_precision(device_type: str) -> Literal["fp32", "bf16"]:
     """Choose by measuring a layer of the heads' size; CUDA takes bf16, other devices what is clearly faster."""

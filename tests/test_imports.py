@@ -11,6 +11,7 @@ RECIPES = {"ls3_recipes"} | {path.stem for path in (ROOT / "recipes").glob("*.py
 
 # What each part of the library may import of it, besides itself.
 MAY_IMPORT = {
+    "_memory": set(),
     "_values": set(),
     "exceptions": set(),
     "options": {"_values"},
@@ -18,12 +19,24 @@ MAY_IMPORT = {
     "modules": {"_checks"},
     "objectives": {"_checks", "layers", "modules"},
     "layers": {"_checks", "modules"},
-    "planners": {"_checks", "_values", "layers", "modules", "options"},
-    "data": {"_checks", "exceptions", "files", "modules", "options"},
+    "planners": {"_checks", "_memory", "_values", "layers", "modules", "options"},
+    "data": {"_checks", "exceptions", "files", "halves", "modules", "options"},
     "baselines": {"_checks", "modules", "objectives"},
     "files": set(),
+    "halves": {"_memory"},
     "agent": {"_checks", "files", "modules", "options", "planners"},
-    "trainers": {"_checks", "agent", "data", "exceptions", "files", "layers", "modules", "objectives", "options"},
+    "trainers": {
+        "_checks",
+        "agent",
+        "data",
+        "exceptions",
+        "files",
+        "halves",
+        "layers",
+        "modules",
+        "objectives",
+        "options",
+    },
     "__init__": {"agent"},
 }
 

@@ -2,7 +2,8 @@ import pytest
 import torch
 from torch import nn
 
-from ls3_torchrl.layers import fastest_precision, keep_freed_memory, members_of, relu_, run_layers, run_stacked
+from ls3_torchrl._memory import keep_freed_memory
+from ls3_torchrl.layers import fastest_precision, members_of, relu_, run_layers, run_stacked
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

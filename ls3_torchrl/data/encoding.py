@@ -20,7 +20,7 @@ def encode_frames(
     key: NestedKey,
     latent_dim: int,
     progress: Callable[[int, int], None] | None = None,
-    chunk: int = 512,
+    chunk: int = 128,
 ) -> TensorDict:
     """Mean ``loc`` and standard deviation ``scale`` of the latents of observations, without gradients.
 
@@ -32,7 +32,7 @@ def encode_frames(
         key: what they are called, for an encoder that reads several keys.
         latent_dim: D, which the encoder must write.
         progress: called with (frames done, frames in all).
-        chunk: frames encoded at a time.
+        chunk: frames encoded at a time; many more leave the caches, and the memory for them is got anew every time.
 
     Returns:
         ``[n]`` with ``loc`` and ``scale``, float32 ``[n, D]``, on the frames' device.

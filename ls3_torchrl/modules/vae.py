@@ -70,7 +70,7 @@ class _ConvolutionalPosterior(nn.Module):
             nn.ReLU(inplace=True),
             nn.Conv2d(32, 64, 4, stride=3),
             nn.ReLU(inplace=True),
-            nn.Conv2d(64, 128, 4, stride=2),
+            FastConv2d(64, 128, 4, stride=2),
             nn.ReLU(inplace=True),
             FastConv2d(128, _FEATURES, 4, stride=2),
             nn.ReLU(inplace=True),
@@ -89,8 +89,11 @@ class _ConvolutionalPosterior(nn.Module):
                 f"got {list(pixels.shape)}. Resize or permute the images, or build the encoder with in_channels "
                 "= 3 x stacked frames."
             )
-        dtype = self.head.weight.dtype
-        images = as_unit_pixels(pixels, dtype)
+        dtype = computed = self.head.weight.dtype
+        # The first convolution would round them to autocast's dtype; to divide in it gives the same.
+        if pixels.device.type == "cpu" and pixels.dtype == torch.uint8 and torch.is_autocast_enabled("cpu"):
+            computed = torch.get_autocast_dtype("cpu")
+        images = as_unit_pixels(pixels, computed)
         if pixels.is_floating_point():
             _require_unit_range(pixels)
         batch = images.shape[:-3]
@@ -158,6 +161,10 @@ class PixelEncoder(ProbabilisticTensorDictSequential):
         self.latent_dim = latent_dim
         self.pixels_key, self.latent_key = pixels_key, latent_key
         self.loc_key, self.scale_key = loc_key, scale_key
+
+    def of_pixels(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation ``[*B, D]`` of the latents of images ``[*B, C, 64, 64]``."""
+        return self[0].module(pixels)
 
     @torch.no_grad()
     def rescale(self, factor: float) -> None:
@@ -253,8 +260,11 @@ class PixelDecoder(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the reconstruction of the latent."""
         require_keys(tensordict, self.in_keys, "PixelDecoder")
-        latent = tensordict.get(self.in_keys[0])
+        return tensordict.set(self.out_keys[0], self.of_latent(tensordict.get(self.in_keys[0])))
+
+    def of_latent(self, latent: Tensor) -> Tensor:
+        """Images ``[*B, C, 64, 64]`` of latents ``[*B, D]``."""
         images = self.network(latent.reshape(-1, latent.shape[-1])).to(latent.dtype)
         if self.background is not None:
             images = images + self.background
-        return tensordict.set(self.out_keys[0], images.reshape(*latent.shape[:-1], *images.shape[-3:]))
+        return images.reshape(*latent.shape[:-1], *images.shape[-3:])

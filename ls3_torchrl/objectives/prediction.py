@@ -88,6 +88,10 @@ class LatentPredictionLoss(LatentLoss):
         both = torch.cat([pixels, next_pixels])
         rows = TensorDict({self.encoder.in_keys[0]: both}, batch_size=both.shape[:1])
         latent, next_latent = encode(self.encoder, rows)[0].chunk(2)
+        return self.of_latents(latent, actions, next_latent)
+
+    def of_latents(self, latent: Tensor, actions: Tensor, next_latent: Tensor) -> dict[str, Tensor]:
+        """The loss of images that are encoded already, to ``[B, D]``, and the actions between them."""
         if actions.ndim == latent.ndim:
             actions = actions.unsqueeze(-2)
         predicted = self._predicted(latent, actions)

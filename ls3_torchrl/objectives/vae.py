@@ -87,13 +87,27 @@ class VAELoss(LatentLoss):
         """The loss on images ``[B, C, 64, 64]``."""
         keys = self.tensor_keys
         pixels = tensordict.get(keys.pixels)
-        target = as_unit_pixels(pixels if keys.target is None else tensordict.get(keys.target), self._dtype())
+        target = as_unit_pixels(pixels if keys.target is None else tensordict.get(keys.target), self.decoder_dtype)
         if keys.target in (None, keys.pixels) and type(self.encoder) is PixelEncoder:
             # Floats in [0, 1] are as good to it; the same images need not be converted twice.
             pixels = target
         rows = TensorDict({self.encoder.in_keys[0]: pixels}, batch_size=pixels.shape[:1])
         loc, scale = encode(self.encoder, rows)
-        reconstruction = call_on_latent(self.decoder, Normal(loc, scale).rsample())
+        return self.of_posterior(loc, scale, target)
+
+    def of_posterior(
+        self, loc: Tensor, scale: Tensor, target: Tensor, *, noise: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """The loss of images that are encoded already.
+
+        Args:
+            loc: mean of q(z|s), ``[B, D]``.
+            scale: its standard deviation, ``[B, D]``.
+            target: the images, floats in [0, 1] ``[B, C, 64, 64]``.
+            noise: standard normal ``[B, D]``, of which z is made; drawn when ``None``.
+        """
+        latent = Normal(loc, scale).rsample() if noise is None else loc + scale * noise
+        reconstruction = call_on_latent(self.decoder, latent)
         if reconstruction.shape != target.shape:
             raise ValueError(
                 f"The decoder writes images of shape {list(reconstruction.shape)} where the images to reconstruct have "
@@ -117,7 +131,8 @@ class VAELoss(LatentLoss):
             "kl": divergence.detach(),
         }
 
-    def _dtype(self) -> torch.dtype:
+    @property
+    def decoder_dtype(self) -> torch.dtype:
         """The dtype that the decoder computes in."""
         return next((p.dtype for p in self.decoder.parameters()), torch.float32)
 

@@ -99,7 +99,6 @@ class VAEOptions:
         enlarge_to: images of a dataset enlarged by random shifts and perspectives, from which batches seem drawn
             (section 1.3.4); ``None`` for the images as they are.
         autocast: bf16 autocast; ``"auto"`` where a short measurement finds it faster.
-        threads: cores to compute on; all when ``None``.
 
     Raises:
         ValueError: naming the field, what was received and what is allowed.
@@ -124,7 +123,6 @@ class VAEOptions:
     crop_scale: tuple[float, float] | None = (0.8, 1.0)
     enlarge_to: int | None = None
     autocast: Autocast = "auto"
-    threads: int | None = None
 
     def __post_init__(self) -> None:
         if self.checkpoint is not None and not isinstance(self.checkpoint, str | Path):
@@ -135,9 +133,8 @@ class VAEOptions:
             )
         for name in ("steps", "batch_size", "prediction_horizon"):
             _require_count(getattr(self, name), 1, name)
-        for name in ("enlarge_to", "threads"):
-            if getattr(self, name) is not None:
-                _require_count(getattr(self, name), 1, name)
+        if self.enlarge_to is not None:
+            _require_count(self.enlarge_to, 1, "enlarge_to")
         _require_above_zero(self.lr, "lr")
         _require_flags(self, "unit_scale")
         require_choice(self.schedule, ("constant", "onecycle"), "schedule")

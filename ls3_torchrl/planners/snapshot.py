@@ -9,10 +9,10 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from ls3_torchrl._memory import keep_freed_memory
 from ls3_torchrl.layers import (
     Layers,
     fastest_precision,
-    keep_freed_memory,
     layers_of,
     members_of,
     stacked_of,

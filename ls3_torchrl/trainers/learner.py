@@ -59,19 +59,12 @@ def new_seed(generator: torch.Generator | None = None) -> int:
     return int(torch.randint(2**63 - 1, (), generator=generator))
 
 
-def descend(optimizer: torch.optim.Optimizer, parameters: Iterable[Parameter], value: Tensor) -> bool:
-    """One gradient step down ``value``; none, and ``False``, when it, its gradient or the square of that is not finite.
-
-    Adam's average of squares would stay infinite for ever, and what it belongs to would never move again.
-    """
-    if not set_gradients(parameters, value):
-        return False
-    optimizer.step()
-    return True
-
-
 def set_gradients(parameters: Iterable[Parameter], value: Tensor) -> bool:
-    """Compute the gradients of ``value``; whether it and the square of its gradient are finite."""
+    """Compute the gradients of ``value``; whether it and the square of its gradient are finite.
+
+    Otherwise no step is to be taken: Adam's average of squares would stay infinite for ever, and what it belongs to would
+    never move again.
+    """
     parameters = list(parameters)
     for parameter in parameters:
         parameter.grad = None
@@ -79,7 +72,7 @@ def set_gradients(parameters: Iterable[Parameter], value: Tensor) -> bool:
     return is_finite(parameters, value)
 
 
-def is_finite(parameters: Iterable[Parameter], value: Tensor) -> bool:
+def is_finite(parameters: Iterable[Tensor], value: Tensor) -> bool:
     """Whether a loss and the square of its gradient are finite."""
     # NaN and infinity outlast a norm, which is cheaper than a look at every entry.
     norm = get_total_norm([parameter.grad for parameter in parameters if parameter.grad is not None])

@@ -14,11 +14,13 @@ from torchrl.record.loggers import Logger
 from ls3_torchrl.agent import LS3Agent
 from ls3_torchrl.data import TaggedReplayBuffer, random_perspective, random_resized_crop
 from ls3_torchrl.exceptions import DivergenceError
+from ls3_torchrl.halves import Halves
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
 from ls3_torchrl.options.training import VAEOptions
 from ls3_torchrl.trainers.checks import require_actions_of
-from ls3_torchrl.trainers.learner import LOG_INTERVAL, descend, log_scalars, threads, wants_bf16
+from ls3_torchrl.trainers.learner import LOG_INTERVAL, is_finite, log_scalars, wants_bf16
 from ls3_torchrl.trainers.progress import progress_bar
+from ls3_torchrl.trainers.vae_gradient import INPUT, TARGET, VAEGradient, in_channel_order, in_memory_order, reordered
 
 _log = logging.getLogger(__name__)
 PHASE = "VAE"
@@ -97,7 +99,6 @@ class VAETrainer:
         for half in (agent.encoder, agent.decoder):
             half.to(memory_format=torch.channels_last)
         self.loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta, reduction=options.reduction)
-        self.loss.set_keys(pixels="vae_input", target="vae_target")
         self._learnt = list(self.loss.parameters())
         self.prediction: LatentPredictionLoss | None = None
         if options.prediction_weight:
@@ -105,14 +106,17 @@ class VAETrainer:
             keys = buffer.keys
             self.prediction.set_keys(pixels=keys.observation, action=keys.action, next_pixels=keys.next_observation)
             self._learnt += agent.dynamics.parameters()
-        self.optimizer = torch.optim.Adam(self._learnt, lr=options.lr, fused=True)
+        self.device = next(agent.parameters()).device
+        self._bf16 = wants_bf16(options.autocast, self.device)
+        self._gradient = VAEGradient(
+            self.loss, self.prediction, self._learnt, observation=buffer.keys.observation, bf16=self._bf16
+        )
+        self.optimizer = torch.optim.Adam(self._gradient.leaves, lr=options.lr, fused=True)
         self.schedule: torch.optim.lr_scheduler.LRScheduler = (
             torch.optim.lr_scheduler.OneCycleLR(self.optimizer, options.lr, total_steps=options.steps, pct_start=0.1)
             if options.schedule == "onecycle"
             else torch.optim.lr_scheduler.ConstantLR(self.optimizer, factor=1.0)
         )
-        self.device = next(agent.parameters()).device
-        self._bf16 = wants_bf16(options.autocast, self.device)
 
     def train(self) -> None:
         """Train what is left of the steps, or take the checkpoint's encoder and decoder; freeze both, encode.
@@ -172,11 +176,11 @@ class VAETrainer:
         if self.steps == 0 and getattr(self.agent.decoder, "background", None) is not None:
             self.agent.decoder.set_background(self.buffer.mean_frame())
         with (
-            threads(options.threads),
+            Halves() as both,
             progress_bar(options.steps, PHASE, done=self.steps, enabled=self.progress) as bar,
         ):
             while self.steps < options.steps:
-                losses = self._step()
+                losses = self._step(both)
                 if self.steps % LOG_INTERVAL == 0 or self.steps == options.steps - 1:
                     scalars = {key: item.item() for key, item in losses.items()}
                     log_scalars(self.logger, PHASE, self.steps, scalars)
@@ -187,20 +191,17 @@ class VAETrainer:
                 if self.after_step is not None:
                     self.after_step()
 
-    def _step(self) -> TensorDictBase:
+    def _step(self, both: Halves) -> TensorDictBase:
         options = self.options
         warmth = warmed_up((self.steps + 1) / options.steps, options.warmup)
         self.loss.beta = options.beta * warmth
         batch = self._sample()
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
-            losses = self.loss(batch)
-            value = losses["loss_vae"]
-            if self.prediction is not None and warmth:
-                losses["prediction"] = self.prediction(batch)["loss_prediction"]
-                value = value + warmth * options.prediction_weight * losses["prediction"]
-        if not descend(self.optimizer, self._learnt, value):
+        noise = torch.randn(options.batch_size, self.buffer.latent_dim, device=self.device)
+        losses, value = self._gradient(batch, noise, warmth * options.prediction_weight, both)
+        if not is_finite(self._gradient.leaves, value):
             scalars = {key: item.item() for key, item in losses.items()}
             raise DivergenceError(PHASE, self.steps, scalars, batch, "Lower VAEOptions.lr.")
+        self.optimizer.step()
         self.schedule.step()
         return losses
 
@@ -216,9 +217,12 @@ class VAETrainer:
                 options.batch_size, without=left_out, steps=steps if steps > 1 else None
             )
         batch = batch.to(self.device)
-        target = batch["vae_target"] = self._enlarge(batch[self.buffer.keys.observation])
-        crop = options.crop_scale
-        batch["vae_input"] = target if crop is None else random_resized_crop(target, scale=crop)
+        images = batch.get(self.buffer.keys.observation)
+        target = self._enlarge(images)
+        if target is not images:
+            batch.set(TARGET, target)
+        if options.crop_scale is not None:
+            batch.set(INPUT, random_resized_crop(target, scale=options.crop_scale))
         return batch
 
     def _enlarge(self, pixels: Tensor) -> Tensor:
@@ -249,7 +253,7 @@ class VAETrainer:
         return {
             "loss": self.loss.state_dict(),
             "dynamics": self.agent.dynamics.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": reordered(self.optimizer.state_dict(), in_channel_order),
             "schedule": self.schedule.state_dict(),
             "steps": self.steps,
             "error": self._error,
@@ -264,7 +268,9 @@ class VAETrainer:
         for parameter in self._learnt:
             parameter.requires_grad_(True)  # it may have been frozen meanwhile
         self.agent.dynamics.load_state_dict(state_dict["dynamics"])
-        self.optimizer.load_state_dict(state_dict["optimizer"])
+        # Contiguous, which the fused Adam takes them to be.
+        ordered = reordered(state_dict["optimizer"], lambda value: in_memory_order(value).contiguous())
+        self.optimizer.load_state_dict(ordered)
         self.schedule.load_state_dict(state_dict["schedule"])
         self.steps, self._error = state_dict["steps"], state_dict["error"]
         self._checked, self._rescaled = state_dict["checked"], state_dict["rescaled"]

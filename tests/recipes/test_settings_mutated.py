@@ -59,7 +59,7 @@ WHOLE = {
     ),
 }
 WHOLE_OR_NULL = dict.fromkeys(
-    ["buffer.success_tail", "task.horizon", "task.offline_episodes", "threads", "vae.enlarge_to", "vae.threads"], 1
+    ["buffer.success_tail", "task.horizon", "task.offline_episodes", "threads", "vae.enlarge_to"], 1
 )
 NUMBERS = {
     **dict.fromkeys(

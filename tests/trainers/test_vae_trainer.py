@@ -1,14 +1,15 @@
 """The VAE's training: what encoder and decoder learn from, what is said when they learn nothing, how it continues."""
 
 import copy
+import threading
 
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import EpisodeKeys, TaggedReplayBuffer
+from ls3_torchrl.halves import Halves
 from ls3_torchrl.objectives import VAELoss
 from ls3_torchrl.trainers import DivergenceError, VAEOptions, VAETrainer
 
@@ -99,11 +100,13 @@ def test_prediction_leaves_out_what_follows_a_violation_where_the_buffer_says_so
     ("warmup", "fractions"),
     [(None, [1.0, 1.0, 1.0, 1.0]), ([0.0, 0.75], [1 / 3, 2 / 3, 1.0, 1.0]), ([0.25, 0.75], [0.0, 0.5, 1.0, 1.0])],
 )
-def test_beta_rises_over_its_fraction_of_the_steps(make_agent, filled, monkeypatch, warmup, fractions):
-    seen, forward = [], VAELoss.forward
-    monkeypatch.setattr(VAELoss, "forward", lambda self, td: (seen.append(self.beta), forward(self, td))[1])
+def test_beta_rises_over_its_fraction_of_the_steps(make_agent, filled, warmup, fractions):
+    seen = []
     options = VAEOptions(**(FAST | {"steps": 4}), beta=0.3, warmup=warmup)
-    VAETrainer(make_agent(), filled(), options, progress=False).train()
+    trainer = VAETrainer(
+        make_agent(), filled(), options, progress=False, after_step=lambda: seen.append(trainer.loss.beta)
+    )
+    trainer._minimise()
     assert seen == pytest.approx([0.3 * fraction for fraction in fractions])
 
 
@@ -141,14 +144,12 @@ def test_training_that_continues_from_its_state_ends_as_one_that_was_never_stopp
         return VAETrainer(make_agent(), filled(content), VAEOptions(steps=6, **settings), progress=False)
 
     whole, first, second = trainer(0), trainer(0), trainer(1)
-    torch.manual_seed(3)
-    for _ in range(6):
-        whole._step()
-        whole.steps += 1
-    torch.manual_seed(3)
-    for _ in range(4):
-        first._step()
-        first.steps += 1
+    for one, steps in ((whole, 6), (first, 4)):
+        torch.manual_seed(3)
+        with Halves() as both:
+            for _ in range(steps):
+                one._step(both)
+                one.steps += 1
     second.load_state_dict(first.state_dict())
     second._minimise()
     assert second.steps == 6
@@ -188,6 +189,37 @@ def test_training_that_was_stopped_at_a_step_ends_as_one_that_was_not(make_agent
         pairs = zip(getattr(whole.agent, half).parameters(), getattr(second.agent, half).parameters(), strict=True)
         assert all(torch.equal(a, b) for a, b in pairs), half
     assert torch.equal(second.buffer.transitions.storage[:]["loc"], whole.buffer.transitions.storage[:]["loc"])
+
+
+def test_the_optimisers_state_has_the_shapes_of_the_weights_and_continues_from_any_order_of_memory(make_agent, filled):
+    trainer = VAETrainer(make_agent(), filled(), VAEOptions(**FAST), progress=False)
+    trainer.train()
+    state = trainer.state_dict()
+    averages = [state["optimizer"]["state"][i] for i in range(len(trainer._learnt))]
+    assert all(of["exp_avg"].shape == p.shape for of, p in zip(averages, trainer._learnt, strict=True))
+    kept = [of["exp_avg"].clone() for of in averages]
+    for of in averages:
+        of["exp_avg"] = of["exp_avg"].contiguous()
+    trainer.load_state_dict(state)
+    again = trainer.state_dict()["optimizer"]["state"]
+    assert all(torch.equal(again[i]["exp_avg"], average) for i, average in enumerate(kept))
+    assert all(of["exp_avg"].is_contiguous() for of in trainer.optimizer.state.values())
+
+
+def test_after_a_step_that_raises_no_thread_is_left(make_agent, filled):
+    def stop():
+        assert torch.get_num_threads() == 1
+        raise KeyboardInterrupt
+
+    before, began = torch.get_num_threads(), threading.active_count()
+    torch.set_num_threads(2)
+    try:
+        trainer = VAETrainer(make_agent(), filled(), VAEOptions(**FAST), progress=False, after_step=stop)
+        with pytest.raises(KeyboardInterrupt):
+            trainer.train()
+        assert (torch.get_num_threads(), threading.active_count()) == (2, began)
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_training_again_once_it_has_ended_changes_nothing(make_agent, filled, episode):
@@ -252,10 +284,19 @@ def test_an_encoder_without_a_decoder_needs_no_training():
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(make_agent, filled, monkeypatch):
-    nothing = {"loss_vae": torch.tensor(torch.nan, requires_grad=True), "reconstruction": torch.tensor(0.0)}
-    monkeypatch.setattr(VAELoss, "forward", lambda self, td: TensorDict(nothing))
-    with pytest.raises(FloatingPointError, match="VAE diverged"):
-        VAETrainer(make_agent(), filled(), VAEOptions(**FAST), progress=False).train()
+    found = VAELoss.of_posterior
+
+    def not_finite(self, loc, scale, target, *, noise):
+        values = found(self, loc, scale, target, noise=noise)
+        return values | {"loss_vae": values["loss_vae"] * torch.nan}
+
+    monkeypatch.setattr(VAELoss, "of_posterior", not_finite)
+    trainer = VAETrainer(make_agent(), filled(), VAEOptions(**FAST), progress=False)
+    before = {key: value.clone() for key, value in trainer.agent.state_dict().items()}
+    with pytest.raises(FloatingPointError, match=r"VAE diverged: .*'loss_vae': nan") as raised:
+        trainer.train()
+    assert raised.value.batch["pixels"].shape == (4, 3, 64, 64)
+    assert all(torch.equal(value, before[key]) for key, value in trainer.agent.state_dict().items())
 
 
 def test_it_can_be_taken_back_to_an_earlier_state(make_agent, filled):
