@@ -62,8 +62,8 @@ def new_seed(generator: torch.Generator | None = None) -> int:
 def set_gradients(parameters: Iterable[Parameter], value: Tensor) -> bool:
     """Compute the gradients of ``value``; whether it and the square of its gradient are finite.
 
-    Otherwise no step is to be taken: Adam's average of squares would stay infinite for ever, and what it belongs to would
-    never move again.
+    Otherwise no step is to be taken: Adam's average of squares would stay infinite for ever, and what it belongs to
+    would never move again.
     """
     parameters = list(parameters)
     for parameter in parameters:
