@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict
-from torch.autograd.profiler_util import FunctionEvent
-from torch.profiler import ProfilerActivity, profile
+from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from ls3_recipes.algorithms.ls3 import LS3Settings
@@ -27,7 +26,7 @@ LAUNCH_US = (5.0, 10.0)
 #: Dense products in bf16 by the makers' data sheets, in TFLOP/s.
 PEAKS = {"H100": 989.0, "A100": 312.0, "L4": 121.0}
 #: Operators that only ask for memory, or change nothing in it.
-_NO_WORK = ("aten::empty", "aten::resize", "aten::set_", "aten::lift_fresh", "aten::result_type", "aten::is_")
+_NO_WORK = ("aten::empty", "aten::resize", "aten::set_", "aten::lift_fresh", "aten::alias", "aten::detach")
 #: Operators for whose result the processor waits.
 _WAITS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::_unique2", "aten::equal")
 
@@ -46,44 +45,37 @@ class Calls(NamedTuple):
     gflop: float
 
 
-def count_calls(call: Callable[[], object]) -> Calls:
-    """Count what a call does on one thread, once.
+class _Operators(TorchDispatchMode):
+    """Collects the names of operators that compute something, in the thread that enters it.
 
-    An operator that is made of others is not counted, but those are; views and empty tensors are left out.
+    It sees what PyTorch hands to a device: operators that are made of others are taken apart by then. A profiler also
+    lists those, and what the processor's own kernels call within.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Note an operator, and call it."""
+        name = func.name()
+        if not func.is_view and not name.startswith(_NO_WORK):
+            self.names.append(name)
+        return func(*args, **(kwargs or {}))
+
+
+def count_calls(call: Callable[[], object]) -> Calls:
+    """Count what a call does on one thread; views and empty tensors are left out.
 
     Example:
         >>> a = torch.ones(4, 8)
-        >>> count_calls(lambda: torch.nn.functional.linear(a, a, torch.ones(4)))
+        >>> count_calls(lambda: torch.nn.functional.linear(a, a, torch.ones(4)).relu())
         Calls(operators=2, waits=0, gflop=2.56e-07)
     """
-    with threads(1):
-        with profile(activities=[ProfilerActivity.CPU], acc_events=True) as trace:
-            call()
-        with FlopCounterMode(display=False) as products:
-            call()
-    names = [name for event in trace.events() if event.cpu_parent is None for name in _working(event)]
+    with threads(1), FlopCounterMode(display=False) as products, _Operators() as operators:
+        call()
+    names = operators.names
     return Calls(len(names), sum(name.startswith(_WAITS) for name in names), products.get_total_flops() / 1e9)
-
-
-def _working(event: FunctionEvent) -> list[str]:
-    """The operators of an event that compute something, from the outermost that is not made of others."""
-    if event.name.startswith("aten::") and not _is_composite(event.name):
-        return [] if _does_nothing(event.name) else [event.name]
-    return [name for child in event.cpu_children for name in _working(child)]
-
-
-def _overloads(name: str) -> list[Any]:
-    packet = getattr(torch.ops.aten, name.removeprefix("aten::"), None)
-    return [] if packet is None else [getattr(packet, overload) for overload in packet.overloads()]
-
-
-def _is_composite(name: str) -> bool:
-    key = torch._C.DispatchKey.CompositeImplicitAutograd
-    return any(overload.has_kernel_for_dispatch_key(key) for overload in _overloads(name))
-
-
-def _does_nothing(name: str) -> bool:
-    return name.startswith(_NO_WORK) or any(overload.is_view for overload in _overloads(name))
 
 
 def count_kernels(work: Workbench) -> list[dict[str, Any]]:
@@ -113,7 +105,7 @@ def _work_of(work: Workbench, preset: LS3Settings) -> dict[str, Callable[[], obj
     latent = torch.randn(1, shape.latent_dim, device=work.device)
     rows = random_rows([batch, shape.num_values], shape.latent_dim, shape.action_dim, work.device)
     images = frames[torch.arange(preset.vae.batch_size) % len(frames)].to(work.device)
-    pixels = TensorDict({"pixels": images}, [len(images)])
+    pixels = TensorDict({"pixels": images}, [len(images)], device=work.device)
     dynamics = EnsembleDynamicsLoss(agent.dynamics, bootstrap=True)
     value = OfflineValueLoss(agent.value, bootstrap=True)
     vae = VAELoss(agent.encoder, agent.decoder)

@@ -41,7 +41,7 @@ def _plot_curve(axis: Axes, curve: dict[str, Any]) -> None:
     axis.errorbar(sizes, costs, half, fmt="o", ms=4, lw=1, capsize=2, color=SAFE, label="measured")
     axis.set(xscale="log", yscale="log", xlabel=curve["unit"])
     axis.set_title(f"{curve['what']}: exponent {slope:.2f}")
-    axis.xaxis.set_major_locator(FixedLocator(sizes))
+    axis.xaxis.set_major_locator(FixedLocator(curve["sizes"]))
     axis.xaxis.set_minor_locator(NullLocator())
     axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.yaxis.set_minor_formatter(NullFormatter())

@@ -88,7 +88,9 @@ def runs_section(run: dict[str, Any]) -> Section:
     mean = _mean_utilisation(run["phases"], whole)
     lines.append(("whole run", f"{whole:.1f}", "100%", "" if math.isnan(mean) else f"{mean:.0%}"))
     columns = ("phase", "seconds", "of the run", f"of {cores} cores used")
-    caption = f"{run['task']}, preset {run['preset']}; cores used: CPU time of all of its processes by wall time and cores"
+    caption = (
+        f"{run['task']}, preset {run['preset']}; cores used: CPU time of all of its processes by wall time and cores"
+    )
     return Section(f"A whole run of {run['preset']}", columns, lines, caption)
 
 

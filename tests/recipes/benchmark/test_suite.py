@@ -10,7 +10,8 @@ from torchrl.data import Bounded
 
 from ls3_recipes.benchmark.planning import agreement, permissive, plan_flops
 from ls3_recipes.benchmark.reference import ReferenceVAE
-from ls3_recipes.benchmark.suite import BenchmarkSettings, run_benchmark
+from ls3_recipes.benchmark.settings import BenchmarkSettings
+from ls3_recipes.benchmark.suite import run_benchmark
 from ls3_recipes.benchmark.timing import Bench
 from ls3_recipes.commands import benchmark as command
 from ls3_recipes.configuration import compose_settings
@@ -25,7 +26,7 @@ def test_the_benchmark_writes_its_figures_and_ratios(tmp_path, capsys):
         "batches=[1,2]",
         "seconds=0.01",
         "device=cpu",
-        "smoke=false",
+        "figures=[planning,updates,vae,environments,buffer]",
         f"output={out}",
     ]
     run_benchmark(compose_settings("benchmark", BenchmarkSettings, settings))
