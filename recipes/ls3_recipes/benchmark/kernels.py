@@ -68,8 +68,8 @@ def count_calls(call: Callable[[], object]) -> Calls:
     """Count what a call does on one thread; views and empty tensors are left out.
 
     Example:
-        >>> a = torch.ones(4, 8)
-        >>> count_calls(lambda: torch.nn.functional.linear(a, a, torch.ones(4)).relu())
+        >>> a, bias = torch.ones(4, 8), torch.ones(4)
+        >>> count_calls(lambda: torch.nn.functional.linear(a, a, bias).relu())
         Calls(operators=2, waits=0, gflop=2.56e-07)
     """
     with threads(1), FlopCounterMode(display=False) as products, _Operators() as operators:
