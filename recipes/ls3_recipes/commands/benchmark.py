@@ -16,9 +16,9 @@ benchmark.md, growth.png and runs.png.
 
   ls3 benchmark [figures=[NAME,...]] [presets=[cpu,paper]] [runs=[cpu]] [estimate=paper] [seconds=S] [reference=false]
 
-Figures: planning, updates, vae, environments, buffer; candidates, particles, horizon, worlds, episodes and images are cost
-as work grows; estimate is the time of a whole run from its steps, kernels what a GPU would be bound by, runs whole runs by
-phase. All are measured unless figures says which; smoke=true measures everything at its smallest.
+Figures: planning, updates, vae, environments, buffer; candidates, particles, horizon, worlds, episodes and images are
+cost as work grows; estimate is the time of a whole run from its steps, kernels what a GPU would be bound by, runs whole
+runs by phase. All are measured unless figures says which; smoke=true measures everything at its smallest.
 
 Every figure is a median with its interquartile range; ratios are taken within the run.
 """
