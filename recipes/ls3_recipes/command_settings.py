@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, make_dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field, make_dataclass, replace
 from typing import Any, get_type_hints
 
 from ls3_envs.registry import DOMAINS
 from ls3_recipes.options import as_dict
 from ls3_recipes.run_settings import TaskSettings, require_device_name, require_path, require_seed, require_threads
+from ls3_recipes.typed import did_you_mean
 from ls3_torchrl._values import require_at_least, require_choice, require_positive
 from ls3_torchrl.options.planner import PlannerOptions
 
@@ -103,33 +105,45 @@ class ReportSettings:
             require_path(path, "output" if path is self.output else "runs")
 
 
+#: Figures of cost as work grows.
+GROWING = ("candidates", "particles", "horizon", "worlds", "episodes", "images")
+#: All figures, in the order in which they are measured.
+FIGURES = ("planning", "updates", "vae", "environments", "buffer", *GROWING, "estimate", "kernels", "runs")
+
+
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkSettings:
     """What is timed.
 
     Args:
+        figures: which of :data:`FIGURES`; all when ``None``.
         task: whose images and actions.
-        presets: whose planners and updates are timed.
+        presets: whose planners and updates are timed; cost as work grows is that of the first.
         domains: whose steps with pixels are timed; all when ``None``.
         batches: environments planned for at once, and stepped at once.
+        estimate: the preset of which the time of a whole run is estimated.
+        runs: presets of which whole runs are timed; one of ``paper`` takes hours.
         agent: a trained ``agent.pt``, to see what bf16 changes in its plans with each preset's planner.
         states: images of demonstrations that it plans from.
         seconds: at least, for each figure.
-        smoke: also time the whole recipe at its smallest.
+        smoke: everything at its smallest, to see that it works: presets, domains, batches, runs and seconds.
         reference: also time the reference, which takes most of the time.
         device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
         threads: intra-op threads; ``None`` leaves PyTorch's choice.
         output: a folder that does not exist yet.
     """
 
+    figures: tuple[str, ...] | None = None
     task: str = "navigation"
     presets: tuple[str, ...] = ("cpu", "paper")
     domains: tuple[str, ...] | None = None
     batches: tuple[int, ...] = (1, 8, 32)
+    estimate: str = "paper"
+    runs: tuple[str, ...] = ("smoke",)
     agent: str | None = None
     states: int = 100
     seconds: float = 2.0
-    smoke: bool = True
+    smoke: bool = False
     reference: bool = True
     device: str = "auto"
     threads: int | None = None
@@ -137,7 +151,8 @@ class BenchmarkSettings:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be timed; encoder and buffer are timed at the first preset's sizes."""
-        for name, example in (("presets", "cpu"), ("batches", "1")):
+        _require_figures(self.figures)
+        for name, example in (("presets", "cpu"), ("batches", "1"), ("runs", "cpu")):
             if not getattr(self, name):
                 raise ValueError(f"{name} must name at least one, such as {name}=[{example}]; got none.")
         require_choice(self.task, tuple(DOMAINS), "task")
@@ -151,3 +166,29 @@ class BenchmarkSettings:
         require_threads(self.threads)
         for name in ("output", "agent"):
             require_path(getattr(self, name), name)
+
+    @property
+    def chosen(self) -> tuple[str, ...]:
+        """The figures that are asked for, in the order of :data:`FIGURES`."""
+        return tuple(name for name in FIGURES if self.figures is None or name in self.figures)
+
+    def at_their_size(self) -> BenchmarkSettings:
+        """These settings, with ``smoke`` carried out."""
+        if not self.smoke:
+            return self
+        one = ("smoke",)
+        small = {"presets": one, "runs": one, "estimate": "smoke", "batches": (1, 2), "domains": (self.task,)}
+        return replace(self, **small, seconds=0.01)  # type: ignore[arg-type]
+
+
+def _require_figures(figures: Iterable[str] | None) -> None:
+    if figures is None:
+        return
+    unknown = [name for name in figures if name not in FIGURES]
+    if unknown or not tuple(figures):
+        hint = did_you_mean(unknown[0], FIGURES) if unknown else ""
+        got = ", ".join(map(repr, unknown)) or "none"
+        raise ValueError(
+            f"figures must be some of {', '.join(FIGURES)}; got {got}{hint or '.'} "
+            f"Write figures=[{FIGURES[0]},{FIGURES[1]}], for example, or leave it out to measure all."
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -9,6 +10,9 @@ from typing import Any
 
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.envs import TransformedEnv
+
+from ls3_envs.cores import available_cores
+from ls3_recipes.cpu_time import cpu_seconds
 
 
 class Progress:
@@ -32,22 +36,45 @@ class Progress:
         #: Updates that are done.
         self.updated = 0
         self._seconds: dict[str, float] = {}
-        self._running: dict[str, float] = {}
+        self._cpu_seconds: dict[str, float] = {}
+        self._running: dict[str, tuple[float, float]] = {}
 
     @property
     def seconds(self) -> dict[str, float]:
         """Wall-clock seconds by kind of work, those of what is going on included."""
         now, out = time.perf_counter(), dict(self._seconds)
-        for name, start in self._running.items():
+        for name, (start, _) in self._running.items():
             out[name] = out.get(name, 0.0) + now - start
         return out
 
+    @property
+    def cpu_seconds(self) -> dict[str, float]:
+        """The same of CPU time, by all processes of the run; NaN where it is not known."""
+        out = dict(self._cpu_seconds)
+        if self._running:
+            now = cpu_seconds()
+            for name, (_, start) in self._running.items():
+                out[name] = out.get(name, 0.0) + now - start
+        return out
+
+    def spent(self) -> dict[str, dict[str, float]]:
+        """What a summary says of the time: ``seconds``, and ``cpu_utilisation`` of the cores where it is known."""
+        seconds, cores = self.seconds, available_cores()
+        used = {
+            # Clock ticks of other processes are coarse: in a short phase they may sum up to more than there was.
+            name: round(min(max(busy / (seconds[name] * cores), 0.0), 1.0), 3)
+            for name, busy in self.cpu_seconds.items()
+            if not math.isnan(busy) and seconds.get(name)
+        }
+        rounded = {name: round(value, 1) for name, value in seconds.items()}
+        return {"seconds": rounded, **({"cpu_utilisation": used} if used else {})}
+
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
-        """Add the block's seconds to those of a kind of work."""
-        self._running[name] = time.perf_counter()
+        """Add the block's seconds, and what the cores did in them, to those of a kind of work."""
+        self._running[name] = time.perf_counter(), cpu_seconds()
         yield
-        self._seconds = self.seconds
+        self._seconds, self._cpu_seconds = self.seconds, self.cpu_seconds
         del self._running[name]
 
     def state_dict(self) -> dict[str, Any]:
@@ -57,6 +84,7 @@ class Progress:
             "collected": self.collected,
             "updated": self.updated,
             "seconds": self.seconds,
+            "cpu_seconds": self.cpu_seconds,
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
@@ -64,6 +92,8 @@ class Progress:
         self.phases = list(state_dict["phases"])
         self.collected, self.updated = state_dict["collected"], state_dict["updated"]
         self._seconds = dict(state_dict["seconds"])
+        unknown = dict.fromkeys(self._seconds, math.nan)  # in states of earlier versions
+        self._cpu_seconds = dict(state_dict.get("cpu_seconds", unknown))
 
 
 class Worlds:

@@ -281,7 +281,7 @@ class Experiment:
 
     def _write(self, summary: dict) -> None:
         summary["minutes"] = self.folder.minutes
-        summary["seconds"] = {name: round(value, 1) for name, value in self.progress.seconds.items()}
+        summary |= self.progress.spent()
         self.folder.write_json("summary.json", summary)
 
     def _summary(self) -> dict:

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import platform
+import sys
 from importlib.metadata import version
 
 import pytest
@@ -217,3 +218,11 @@ def test_a_run_whose_data_were_there_already_learns_the_same(no_probe, run_folde
     assert not (folder / "demonstrations").exists()
     one, other = (LS3Agent.load(path / "agent.pt").state_dict() for path in (run_folder, folder))
     assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_the_summary_says_how_busy_the_cores_were(run_folder):
+    summary = json.loads((run_folder / "summary.json").read_text())
+    if sys.platform == "linux":
+        # Phases too short for the clock's ticks are there as well.
+        assert summary["cpu_utilisation"].keys() == summary["seconds"].keys()
+    assert all(0.0 <= used <= 1.0 for used in summary.get("cpu_utilisation", {}).values())

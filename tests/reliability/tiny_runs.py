@@ -22,7 +22,7 @@ ALWAYS = "checkpoint_minutes=1e-9"
 PHASES = ["demonstrations", "VAE", "encoding", "Dynamics", "Value, reward-to-go", "Value, TD-1", "Safe set"]
 PHASES += ["Constraint", "Goal", "saving", "planning", "keeping episodes", "evaluation"]
 #: Of a summary, what tells of the clock.
-CLOCK = ("minutes", "seconds")
+CLOCK = ("minutes", "seconds", "cpu_utilisation")
 
 
 class Moment:

@@ -11,9 +11,14 @@ from ls3_recipes.extra import Job
 from ls3_recipes.renamed import RENAMED_OF_BENCHMARK
 
 HELP = """
-Time planning, updates, the VAE, encoding, environments and buffer; write benchmark.json and a table.
+Time planning, updates, the VAE, environments and buffer, cost as work grows, and whole runs; write benchmark.json,
+benchmark.md, growth.png and runs.png.
 
-  ls3 benchmark [presets=[cpu,paper]] [domains=[NAME,...]] [batches=[1,8,32]] [seconds=S] [reference=false]
+  ls3 benchmark [figures=[NAME,...]] [presets=[cpu,paper]] [runs=[cpu]] [estimate=paper] [seconds=S] [reference=false]
+
+Figures: planning, updates, vae, environments, buffer; candidates, particles, horizon, worlds, episodes and images are
+cost as work grows; estimate is the time of a whole run from its steps, kernels what a GPU would be bound by, runs whole
+runs by phase. All are measured unless figures says which; smoke=true measures everything at its smallest.
 
 Every figure is a median with its interquartile range; ratios are taken within the run.
 """

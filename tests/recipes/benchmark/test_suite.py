@@ -26,7 +26,7 @@ def test_the_benchmark_writes_its_figures_and_ratios(tmp_path, capsys):
         "batches=[1,2]",
         "seconds=0.01",
         "device=cpu",
-        "smoke=false",
+        "figures=[planning,updates,vae,environments,buffer]",
         f"output={out}",
     ]
     run_benchmark(compose_settings("benchmark", BenchmarkSettings, settings))
