@@ -94,7 +94,7 @@ def require_threads(threads: int | None) -> None:
 
 def require_device_name(name: str) -> None:
     """Raise ``ValueError`` for what is no name of a device; whether it is there is seen when it is used."""
-    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,4})?", name):
+    if not re.fullmatch(r"auto|cpu|cuda(:[0-9]{1,4})?", name):
         raise ValueError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}.")
 
 

@@ -3,6 +3,7 @@
 import copy
 import functools
 import math
+import re
 
 import pytest
 from hypothesis import example, given, settings
@@ -186,6 +187,8 @@ def is_allowed(name, value):
     assert name in TEXTS | PATHS, f"{name} is new: say above what it may be"
     if type(value) is not str or name == "vae.checkpoint":
         return False  # no file is there
+    if name == "device":
+        return value in ("auto", "cpu", "cuda") or re.fullmatch("cuda:[0-9]{1,4}", value) is not None
     return name not in PATHS or bool(value.strip() and "\0" not in value)
 
 
