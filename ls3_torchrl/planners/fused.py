@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,6 +18,7 @@ from torch import Tensor, nn
 from ls3_torchrl._checks import require_choice
 from ls3_torchrl.layers import run_layers, run_stacked
 from ls3_torchrl.options.planner import ConstraintReduction, Precision, SafeSetReduction
+from ls3_torchrl.planners.forked import HelperError, Helpers, may_fork
 from ls3_torchrl.planners.fusable import require_fusable, why_not_fused
 from ls3_torchrl.planners.imagination import ImaginationNoise, Limits
 from ls3_torchrl.planners.latent_env import LatentEnv
@@ -24,9 +28,11 @@ from ls3_torchrl.planners.unrolling import Grouping, group_by_member, unroll
 
 #: Particles that are carried together: their widest layer stays in a core's cache, or fills a GPU.
 _CPU_BLOCK, _GPU_BLOCK = 5120, 262_144
-#: Particles of plans under which a part is not worth a core: at 500 two cores are as fast as one, at 1000 1.2 times.
-_SMALLEST_PART = 768
-Job = TypeVar("Job")
+#: Particles of plans under which a part is not worth a core.
+_SMALLEST_PART = 384
+#: Calls with one snapshot, about two plans, before processes are forked for those that will follow.
+_CALLS_BEFORE_FORK = 8
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
@@ -35,31 +41,35 @@ def _take_one_thread() -> None:
 
 
 @lru_cache(maxsize=2)
-def _pool(workers: int) -> ThreadPoolExecutor:
+def _pool(workers: int, process: int) -> ThreadPoolExecutor:  # a fork does not have the threads of its parent
     return ThreadPoolExecutor(workers, thread_name_prefix="imagination", initializer=_take_one_thread)
 
 
-def _side_by_side(job: Callable[[Job], Result], items: Sequence[Job], workers: int) -> list[Result]:
-    """Results of ``job`` on each item: whole items on each core, since layers this small gain nothing from sharing."""
-    if workers < 2:
-        return [job(item) for item in items]
+@contextmanager
+def _one_core_each(workers: int) -> Iterator[None]:
+    """Each part is computed on one core: layers this small gain nothing from sharing."""
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(workers)
+
+
+def _in_threads(function: Callable[[Item], Result], items: Sequence[Item], workers: int) -> list[Result]:
+    """Results of a function of each item, in as many threads as there are cores."""
     left, found = iter(enumerate(items)), {}
 
     def work() -> None:
         for i, item in left:
-            found[i] = job(item)
+            found[i] = function(item)
 
-    torch.set_num_threads(1)
+    # This thread works too: a helper that has to wake first costs a good part of a small plan.
+    helpers = [_pool(workers, os.getpid()).submit(work) for _ in range(min(workers, len(items)) - 1)]
     try:
-        # This thread works too: a helper that has to wake first costs a good part of a small plan.
-        helpers = [_pool(workers).submit(work) for _ in range(min(workers, len(items)) - 1)]
-        try:
-            work()
-        finally:
-            for helper in helpers:
-                helper.result()
+        work()
     finally:
-        torch.set_num_threads(workers)
+        for helper in helpers:
+            helper.result()
     return [found[i] for i in range(len(items))]
 
 
@@ -112,6 +122,8 @@ class FusedImagination:
         self._compiled_plans: int | None = None  # plans in a block that is worth compiling
         self._snapshot = Snapshot(env, value, safe_set, precision)
         self._parameters_fixed = False
+        self._helpers: Helpers | None = None
+        self._calls = 0  # with this snapshot, that processes would have shared
 
     @staticmethod
     def supports(env: nn.Module, value: nn.Module, safe_set: nn.Module) -> bool:
@@ -121,11 +133,19 @@ class FusedImagination:
     def __getstate__(self) -> dict[str, Any]:
         """All but what was compiled, which is compiled anew where it is needed."""
         kept = {name: value for name, value in vars(self).items() if name != "_replay"}
-        return {**kept, "_compiled_plans": None, "_parameters_fixed": False}
+        return {**kept, "_compiled_plans": None, "_parameters_fixed": False, "_helpers": None, "_calls": 0}
 
     def refresh(self) -> bool:
         """Take the snapshot anew if a parameter changed; return whether it had."""
-        return self._snapshot.refresh()
+        changed = self._snapshot.refresh()
+        if changed:
+            self._end_helpers()
+        return changed
+
+    def _end_helpers(self) -> None:
+        if self._helpers is not None:
+            self._helpers.end()
+        self._helpers, self._calls = None, 0
 
     @contextmanager
     def parameters_fixed(self) -> Iterator[None]:
@@ -161,7 +181,7 @@ class FusedImagination:
         groups = group_by_member(noise.members) if on_cpu and not compiled else None
         still = groups is not None and not noise.noise.any()  # then no particle needs its standard deviation
 
-        def imagine(part: slice) -> PlanStatistics:
+        def job_of(part: slice) -> tuple[Any, ...]:
             # Rows of the batch lie one after another: a part may hold plans of several.
             rows, row_of = _rows_of(part, n, latent.device)
             start, plan = latent[rows], steps[:, part].contiguous()
@@ -171,14 +191,12 @@ class FusedImagination:
                 own = own._replace(safe_set_threshold=own.safe_set_threshold[row_of])
             if compiled and row_of is not None:
                 start, row_of = start[row_of], None  # one shape for all blocks
-            if compiled and plan.shape[1] == self._compiled_plans:
-                torch.compiler.cudagraph_mark_step_begin()
-                # Copies, since the next replay writes over what this one returns.
-                args = start, row_of, plan, noise.members, None, drawn, None
-                return PlanStatistics(*(x.clone() for x in self._replay(*args)))
-            return self._imagine(start, row_of, plan, noise.members, groups, drawn, own)
+            return start, row_of, plan, noise.members, groups, drawn, own
 
-        found = _side_by_side(imagine, parts, 1 if compiled else workers)
+        if compiled:
+            found = [self._compiled(*job_of(part)) for part in parts]
+        else:
+            found = self._side_by_side(job_of, parts, workers)
         return PlanStatistics(*(torch.cat(pieces).unflatten(0, (b, n)) for pieces in zip(*found, strict=True)))
 
     def _parts(self, plans: int, particles: int, workers: int, *, on_cpu: bool) -> list[slice]:
@@ -190,6 +208,54 @@ class FusedImagination:
         number = max(least, -(-least // workers) * workers if useful >= workers else 1)
         size = -(-plans // max(1, min(number, plans)))
         return [slice(start, min(start + size, plans)) for start in range(0, plans, size)]
+
+    def _side_by_side(
+        self, job_of: Callable[[slice], tuple[Any, ...]], parts: Sequence[slice], workers: int
+    ) -> list[PlanStatistics]:
+        """What :meth:`_imagine` returns for each part, on as many cores as there are."""
+
+        def imagine(part: slice) -> PlanStatistics:
+            return self._imagine(*job_of(part))
+
+        if workers < 2:
+            return [imagine(part) for part in parts]
+        with _one_core_each(workers):
+            if len(parts) == 1:
+                return [imagine(parts[0])]
+            helpers = self._helpers_for(workers)
+            if helpers is None:
+                return _in_threads(imagine, parts, workers)
+            try:
+                return helpers(self._imagine, parts, job_of)
+            except HelperError:
+                warnings.warn(
+                    "A process that imagines plans has ended or fallen silent; threads take its place until the "
+                    "weights change. The plans stay the same. Was memory short?",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+                self._calls = -sys.maxsize
+                return _in_threads(imagine, parts, workers)
+            finally:
+                if helpers is not None and not helpers.end.alive:
+                    self._helpers = None
+
+    def _helpers_for(self, workers: int) -> Helpers | None:
+        """Processes that have this snapshot, where they pay."""
+        if self._helpers is not None and len(self._helpers) != workers - 1:
+            self._end_helpers()
+        self._calls += 1
+        if self._helpers is None and self._calls > _CALLS_BEFORE_FORK and may_fork():
+            self._helpers = Helpers(self._imagine, workers - 1)
+        return self._helpers
+
+    def _compiled(self, start: Tensor, row_of: Tensor | None, plan: Tensor, *others: Any) -> PlanStatistics:
+        """What :meth:`_imagine` returns, by replay where the block has the size that is compiled."""
+        if plan.shape[1] != self._compiled_plans:
+            return self._imagine(start, row_of, plan, *others)
+        torch.compiler.cudagraph_mark_step_begin()
+        # Copies, since the next replay writes over what this one returns.
+        return PlanStatistics(*(x.clone() for x in self._replay(start, row_of, plan, *others)))
 
     @cached_property
     def _replay(self) -> Callable[..., PlanStatistics]:

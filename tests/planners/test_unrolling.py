@@ -7,7 +7,7 @@ from torchrl.data import Bounded
 from ls3_torchrl.modules import ConstraintEstimator, EnsembleDynamics, GoalEstimator, SafeSet, ValueEnsemble
 from ls3_torchrl.planners import FusedImagination, ImaginationNoise, LatentEnv, RolloutImagination
 from ls3_torchrl.planners import fused as fused_module
-from ls3_torchrl.planners.fused import _side_by_side
+from ls3_torchrl.planners.fused import _in_threads
 from ls3_torchrl.planners.unrolling import group_by_member
 
 D, A, M, B, N, H = 4, 3, 3, 3, 7, 4
@@ -82,8 +82,8 @@ def test_results_come_in_order_and_errors_come_through(workers):
             raise KeyError(i)
         return i * i
 
-    assert _side_by_side(job, range(7), workers) == [0, 1, 4, 9, 16, 25, 36]
+    assert _in_threads(job, range(7), workers) == [0, 1, 4, 9, 16, 25, 36]
     with pytest.raises(KeyError):
-        _side_by_side(job, range(9), workers)
-    assert _side_by_side(job, range(2), workers) == [0, 1]
+        _in_threads(job, range(9), workers)
+    assert _in_threads(job, range(2), workers) == [0, 1]
     torch.set_num_threads(threads)
