@@ -95,8 +95,11 @@ class BatchStream:
         now = (self.buffer.version, keys)
         if self._generator is not None and (self._taken == len(self._batches) or self._seen != now):
             self._start, self._taken, self._batches = self._generator.get_state(), 0, ()
-        if not self._batches:
+        while not self._batches:
             self._batches, self._seen = self._draw(keys), now
+            if self._taken == len(self._batches):  # a state that was taken when all of them were used
+                assert self._generator is not None
+                self._start, self._taken, self._batches = self._generator.get_state(), 0, ()
         batch = self._batches[self._taken]
         self._taken += 1
         return batch if self.change is None else self.change(batch.copy())

@@ -107,13 +107,18 @@ def call_on_latent(
 
 def asks_of_latent_alone(network: nn.Module) -> bool:
     """Whether calling a module writes what its ``of_latent`` computes, and nothing else happens."""
-    hooked = network._forward_hooks or network._forward_pre_hooks or "forward" in vars(network)
     kind = type(network)
     if kind not in _ASKS_OF_LATENT:
         # The class that defines forward defines of_latent as well; one that redefines it alone may do something else.
         asks = next(("of_latent" in vars(base) for base in kind.__mro__ if "forward" in vars(base)), False)
-        _ASKS_OF_LATENT[kind] = asks
-    return not hooked and _ASKS_OF_LATENT[kind]
+        _ASKS_OF_LATENT[kind] = asks and kind.__call__ is TensorDictModuleBase.__call__
+    return _ASKS_OF_LATENT[kind] and not is_hooked(network)
+
+
+def is_hooked(module: nn.Module) -> bool:
+    """Whether calling a module does more than its class says: hooks, or a ``forward`` of its own."""
+    hooks = module._forward_pre_hooks, module._forward_hooks, module._backward_pre_hooks, module._backward_hooks
+    return any(hooks) or "forward" in vars(module)
 
 
 def _last(key: NestedKey) -> str:

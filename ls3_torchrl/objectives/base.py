@@ -83,7 +83,9 @@ class LatentLoss(LossModule):
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         cls.default_keys = cls._AcceptedKeys
-        cls._has_plain_forward = cls._has_plain_forward and "forward" not in vars(cls)  # before TorchRL has wrapped it
+        mixins = [base for base in cls.__mro__[1 : cls.__mro__.index(LatentLoss)] if not issubclass(base, LatentLoss)]
+        own = any("forward" in vars(base) for base in (cls, *mixins))  # before TorchRL has wrapped that of the class
+        cls._has_plain_forward = cls._has_plain_forward and not own
 
     def _start_from_keys(self, **defaults: NestedKey) -> None:
         """Take other default keys than the class has, such as those of the modules that the loss is made for."""
@@ -119,7 +121,9 @@ class LatentLoss(LossModule):
     @property
     def is_plain(self) -> bool:
         """Whether a call does nothing but compute :meth:`losses`: no hooks, no other ``forward``."""
-        return not (self._forward_hooks or "forward" in vars(self)) and self._has_plain_forward
+        checks = [hook for hook in self._forward_pre_hooks.values() if not hook.__module__.startswith("torchrl.")]
+        hooks = checks, self._forward_hooks, self._backward_pre_hooks, self._backward_hooks
+        return self._has_plain_forward and not (any(hooks) or "forward" in vars(self))
 
 
 def with_members(target: Tensor, predicted: Tensor, who: str, *, trailing: int = 1) -> Tensor:

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from ls3_torchrl.layers import is_relu_mlp
-from ls3_torchrl.modules.call import Weights, asks_of_latent_alone, call_on_latent
+from ls3_torchrl.modules.call import Weights, asks_of_latent_alone, call_on_latent, is_hooked
 from ls3_torchrl.modules.classifiers import LatentClassifier, redefines
 from ls3_torchrl.modules.ensemble import run_stacked
 from ls3_torchrl.objectives.base import LatentLoss
@@ -51,6 +51,8 @@ class HeadLoss(LatentLoss):
         head = getattr(self, self.head)
         own = isinstance(head, LatentClassifier) and asks_of_latent_alone(head)
         if not own or redefines(head, LatentClassifier, "of_latent") or not is_relu_mlp(head.network):
+            return None
+        if any(is_hooked(part) for part in head.network.modules()):
             return None
         linear = {f"network.{i}": layer for i, layer in enumerate(head.network) if isinstance(layer, nn.Linear)}
         weights = self._head_weights()

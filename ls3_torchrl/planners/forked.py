@@ -51,6 +51,7 @@ class Helpers:
 
     def __init__(self, function: Callable[..., Any], number: int) -> None:
         context = multiprocessing.get_context("fork")
+        self._owner = os.getpid()
         self._connections: list[Connection] = []
         processes = []
         for _ in range(number):
@@ -68,6 +69,11 @@ class Helpers:
 
     def __len__(self) -> int:
         return len(self._connections)
+
+    @property
+    def are_mine(self) -> bool:
+        """Whether this process has forked them; a fork of it must not talk to them."""
+        return self._owner == os.getpid()
 
     def __call__(
         self, function: Callable[..., Any], items: Sequence[Item], arguments: Callable[[Item], tuple[Any, ...]]
@@ -118,7 +124,7 @@ def _receive(connection: Connection) -> list[Any]:
         if not connection.poll(_SILENCE):
             raise HelperError
         answer = pickle.loads(connection.recv_bytes())
-    except (EOFError, OSError) as error:
+    except (EOFError, OSError, pickle.UnpicklingError) as error:
         raise HelperError from error
     if isinstance(answer, Exception):
         raise answer

@@ -17,8 +17,8 @@ from ls3_torchrl.planners.latent_env import LatentEnv
 _METHODS: dict[type, tuple[str, ...]] = {
     LatentEnv: ("__call__", "forward", "step", "_step", "reset", "_reset", "rollout", "_observe"),
     EnsembleDynamics: ("__call__", "forward", "network_input", "read_output", "distribution"),
-    ValueEnsemble: ("__call__", "forward"),
-    LatentClassifier: ("__call__", "forward", "probability"),
+    ValueEnsemble: ("__call__", "forward", "of_latent"),
+    LatentClassifier: ("__call__", "forward", "of_latent", "probability"),
 }
 
 

@@ -123,6 +123,7 @@ class FusedImagination:
         self._snapshot = Snapshot(env, value, safe_set, precision)
         self._parameters_fixed = False
         self._helpers: Helpers | None = None
+        self._reduced_by: tuple[Any, ...] = ()  # the helpers
         self._calls = 0  # with this snapshot, that processes would have shared
 
     @staticmethod
@@ -242,11 +243,14 @@ class FusedImagination:
 
     def _helpers_for(self, workers: int) -> Helpers | None:
         """Processes that have this snapshot, where they pay."""
-        if self._helpers is not None and len(self._helpers) != workers - 1:
+        reduced_by = self.constraint_reduction, self.safe_set_reduction, self.block
+        if self._helpers is not None and not self._helpers.are_mine:
+            self._helpers, self._calls = None, 0
+        if self._helpers is not None and (len(self._helpers) != workers - 1 or reduced_by != self._reduced_by):
             self._end_helpers()
         self._calls += 1
         if self._helpers is None and self._calls > _CALLS_BEFORE_FORK and may_fork():
-            self._helpers = Helpers(self._imagine, workers - 1)
+            self._helpers, self._reduced_by = Helpers(self._imagine, workers - 1), reduced_by
         return self._helpers
 
     def _compiled(self, start: Tensor, row_of: Tensor | None, plan: Tensor, *others: Any) -> PlanStatistics:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -78,8 +79,8 @@ class LearnerGroup:
                 "being called then."
             )
         if not self._stages:
-            self._stages = wanted
-            self._seeds = [new_seed() if self.learners[name].streams else None for name, _, _ in wanted]
+            seeds = [new_seed() if self.learners[name].streams else None for name, _, _ in wanted]
+            self._stages, self._seeds = wanted, seeds
         chains = [chain for chain in self._chains() if all(self._learner(i).is_independent for i in _flat(chain))]
         if (
             min(len(chains), torch.get_num_threads()) > 1
@@ -244,6 +245,11 @@ def _tensors(learner: Learner) -> set[int]:
 
 
 def _may_fork(learners: Iterable[Learner]) -> bool:
-    """Whether a forked process can train: on Linux, without an accelerator, whose threads a fork would lose."""
+    """Whether a forked process can train: on Linux, without an accelerator, whose threads a fork would lose.
+
+    Daemons may not have processes.
+    """
+    if multiprocessing.current_process().daemon:
+        return False
     devices = {parameter.device.type for learner in learners for parameter in learner.parameters}
     return sys.platform == "linux" and devices == {"cpu"} and not torch.accelerator.is_available()

@@ -48,7 +48,7 @@ class _Worker:
 
     def __init__(self, process: Any, connection: Connection) -> None:
         self.process, self.connection = process, connection
-        self.busy, self.heard = True, time.monotonic()
+        self.busy, self.silence = True, 0.0  # seconds that were waited for a word
 
 
 class Processes:
@@ -71,15 +71,22 @@ class Processes:
         self._asked: set[_Worker] = set()  # whose states are awaited
         context = multiprocessing.get_context("fork")
         self._workers: list[_Worker] = []
-        for task, number in zip(tasks, nice, strict=True):
-            ours, theirs = context.Pipe()
-            process = context.Process(target=self._work, args=(task, number, theirs, os.getpid()), daemon=True)
-            with warnings.catch_warnings():
-                # Later Pythons warn of locks that other threads hold. These are idle, and silence is waited out.
-                warnings.simplefilter("ignore", DeprecationWarning)
-                process.start()
-            theirs.close()
-            self._workers.append(_Worker(process, ours))
+        try:
+            for task, number in zip(tasks, nice, strict=True):
+                ours, theirs = context.Pipe()
+                # A process has copies of these ends. With them it would wait for itself when nobody else is there.
+                others = [ours, *(worker.connection for worker in self._workers)]
+                args = (task, number, theirs, others, os.getpid())
+                process = context.Process(target=self._work, args=args, daemon=True)
+                with warnings.catch_warnings():
+                    # Later Pythons warn of locks that other threads hold. These are idle, and silence is waited out.
+                    warnings.simplefilter("ignore", DeprecationWarning)
+                    process.start()
+                theirs.close()
+                self._workers.append(_Worker(process, ours))
+        except BaseException:
+            self.__exit__()
+            raise
 
     def __enter__(self) -> Processes:
         return self
@@ -110,7 +117,9 @@ class Processes:
                 if (report := self._hear(worker)) is not None:
                     yield report
             for worker in set(busy.values()) - set(spoken):
-                if time.monotonic() - worker.heard > _SILENCE:
+                # Not by the clock: it goes on while all of them are stopped.
+                worker.silence += _TICK if not spoken else 0.0
+                if worker.silence > _SILENCE:
                     self._give_up(worker)
             yield None
 
@@ -120,7 +129,7 @@ class Processes:
         except (EOFError, OSError):
             self._give_up(worker)
             return None
-        worker.heard = time.monotonic()
+        worker.silence = 0.0
         if report.state is not None and worker in self._asked:
             self._asked.remove(worker)
             report.all_states = not self._asked
@@ -140,8 +149,10 @@ class Processes:
         worker.busy = False
         worker.process.kill()
 
-    def _work(self, task: Any, nice: int, connection: Connection, parent: int) -> None:
+    def _work(self, task: Any, nice: int, connection: Connection, others: Sequence[Connection], parent: int) -> None:
         """What a process does."""
+        for other in others:
+            other.close()
         os.nice(nice)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             # A terminal sends Ctrl-C to all, a service manager SIGTERM; who has forked this process ends it.

@@ -13,9 +13,21 @@ from ls3_torchrl.trainers.progress import Bar
 
 def can_train_together(learners: Sequence[Learner]) -> bool:
     """Whether learners can take the same steps at once: losses of networks of one shape, computed in one precision."""
-    plain = all(learner.auxiliary is None and learner.optimizer is not None for learner in learners)
-    alike = len({(learner.bf16, learner.phase_steps) for learner in learners}) == 1
-    return plain and alike and StackedHeads.can_stack([learner.loss for learner in learners])  # type: ignore[misc]
+    plain = all(
+        type(one) is Learner and one.is_independent and one.auxiliary is None and one.optimizer is not None
+        for one in learners
+    )
+    if not plain or len({_kind(learner) for learner in learners}) > 1:
+        return False
+    parameters = [id(parameter) for learner in learners for parameter in learner.loss.parameters()]
+    return len(parameters) == len(set(parameters)) and StackedHeads.can_stack([learner.loss for learner in learners])  # type: ignore[misc]
+
+
+def _kind(learner: Learner) -> tuple[object, ...]:
+    """What learners must have in common."""
+    (batches,) = learner.streams
+    size = batches.batch_size, batches.members, batches.selection.steps
+    return learner.bf16, learner.phase_steps, learner.parameters[0].device, size
 
 
 def train_together(

@@ -108,6 +108,7 @@ class VAETrainer:
             self._learnt += agent.dynamics.parameters()
         self.device = next(agent.parameters()).device
         self._bf16 = wants_bf16(options.autocast, self.device)
+        self._learnt = [parameter for parameter in self._learnt if parameter.requires_grad]
         self._gradient = VAEGradient(
             self.loss, self.prediction, self._learnt, observation=buffer.keys.observation, bf16=self._bf16
         )
@@ -173,6 +174,7 @@ class VAETrainer:
 
     def _minimise(self) -> None:
         options = self.options
+        self._gradient.follow()
         if self.steps == 0 and getattr(self.agent.decoder, "background", None) is not None:
             self.agent.decoder.set_background(self.buffer.mean_frame())
         with (

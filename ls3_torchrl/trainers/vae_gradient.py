@@ -14,7 +14,7 @@ from torch.nn.modules.dropout import _DropoutNd
 
 from ls3_torchrl.halves import Halves
 from ls3_torchrl.modules import EnsembleDynamics, PixelDecoder, PixelEncoder
-from ls3_torchrl.modules.call import encode
+from ls3_torchrl.modules.call import encode, is_hooked
 from ls3_torchrl.modules.vae import as_unit_pixels
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
 
@@ -53,6 +53,11 @@ class VAEGradient:
         self.leaves = [in_memory_order(parameter) for parameter in self.parameters]
         self._sums = [torch.zeros_like(leaf) for leaf in self.leaves]
 
+    def follow(self) -> None:
+        """Share the values with the parameters again, where these have got memory of another order."""
+        for leaf, parameter in zip(self.leaves, self.parameters, strict=True):
+            leaf.data = in_memory_order(parameter)
+
     def __call__(
         self, batch: TensorDictBase, noise: Tensor, weight: float, both: Halves
     ) -> tuple[TensorDictBase, Tensor]:
@@ -87,7 +92,7 @@ class VAEGradient:
             known.append(EnsembleDynamics)
         ours = all(type(module) is kind for module, kind in zip(modules, known, strict=True))
         parts = [part for module in modules for part in module.modules()]
-        mixed = any(isinstance(part, _BatchNorm | _DropoutNd) or part._forward_hooks for part in parts)
+        mixed = any(isinstance(part, _BatchNorm | _DropoutNd) or is_hooked(part) for part in parts)
         return ours and not mixed and self.parameters[0].device.type == "cpu"
 
     def _part(self, batch: TensorDictBase, noise: Tensor, weight: float, share: float) -> _Computed:
@@ -125,7 +130,7 @@ class VAEGradient:
 
     def _encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
         encoder = self.loss.encoder
-        if type(encoder) is PixelEncoder:
+        if type(encoder) is PixelEncoder and not is_hooked(encoder):
             return encoder.of_pixels(images)
         return encode(encoder, TensorDict({}, [len(images)]).set(encoder.in_keys[0], images))
 

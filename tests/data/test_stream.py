@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from ls3_torchrl.data import BatchStream, RowSelection, TaggedReplayBuffer
+from ls3_torchrl.data import stream as stream_module
 
 READS = TensorDictModule(torch.nn.Linear(4, 1), in_keys=["latent"], out_keys=["anything"])
 
@@ -147,3 +148,17 @@ def test_without_encoder_or_rows_the_first_batch_says_so(buffer):
         stream_of(buffer, selection=RowSelection(tags=["online"]))()
     with pytest.raises(KeyError, match="nowhere"):
         stream_of(buffer, extra_keys=["nowhere"])()
+
+
+def test_a_state_from_the_end_of_what_was_drawn_goes_on(buffer, monkeypatch):
+    monkeypatch.setattr(stream_module, "_ROWS", 24)  # three batches of eight
+    uncut = stream_of(buffer)
+    batches = [uncut()["latent"] for _ in range(7)]
+    for taken in range(7):
+        stopped = stream_of(buffer)
+        for _ in range(taken):
+            stopped()
+        for other in (stream_of(buffer), copy.deepcopy(stopped)):
+            if other.buffer is buffer:
+                other.load_state_dict(stopped.state_dict())
+            assert all(torch.equal(other()["latent"], batch) for batch in batches[taken:])

@@ -94,3 +94,24 @@ def test_a_hook_on_a_classifier_or_a_loss_is_not_passed_over():
     losses = three()
     losses[2].register_forward_hook(lambda *_: None)
     assert not StackedHeads.can_stack(losses)
+
+
+class Counting:
+    """Wraps ``forward`` without being a loss."""
+
+    def forward(self, tensordict):
+        self.calls = getattr(self, "calls", 0) + 1
+        return super().forward(tensordict)
+
+
+class Counted(Counting, ClassifierLoss):
+    pass
+
+
+def test_what_happens_in_a_call_is_known():
+    assert ClassifierLoss(GoalEstimator(4)).is_plain
+    assert not Counted(GoalEstimator(4)).is_plain
+    for register in ("register_forward_hook", "register_forward_pre_hook", "register_full_backward_hook"):
+        loss = ClassifierLoss(GoalEstimator(4))
+        getattr(loss, register)(lambda *_: None)
+        assert not loss.is_plain

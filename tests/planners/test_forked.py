@@ -196,3 +196,30 @@ def test_a_daemon_has_threads_instead(imagine):
     daemon.start()
     assert listener.recv() == 0
     daemon.join()
+
+
+def test_a_fork_leaves_the_processes_of_its_parent_alone(imagine):
+    expected = [imagine(*work()) for _ in range(2)][-1]
+
+    def plan():
+        for _ in range(20):
+            found = imagine(*work(1))
+        connection.send(found.safe_set_prob.numpy())
+
+    context = multiprocessing.get_context("fork")
+    listener, connection = context.Pipe(duplex=False)
+    other = context.Process(target=plan)
+    other.start()
+    for _ in range(20):
+        assert_same(imagine(*work()), expected)
+    theirs = listener.recv()
+    other.join()
+    assert torch.equal(imagine(*work(1)).safe_set_prob, torch.from_numpy(theirs))
+
+
+def test_another_reduction_is_seen(imagine):
+    first = [imagine(*work()) for _ in range(3)][-1]
+    imagine.constraint_reduction = "mean"
+    changed = [imagine(*work()) for _ in range(3)]
+    assert (changed[0].constraint_prob < first.constraint_prob).all()
+    assert_same(changed[0], changed[2])

@@ -32,7 +32,11 @@ METHODS = [
     ("dynamics", "read_output"),
     ("dynamics", "distribution"),
     ("value", "forward"),
-    *((name, method) for name in ("constraint", "goal", "safe_set") for method in ("forward", "probability")),
+    *(
+        (name, method)
+        for name in ("constraint", "goal", "safe_set")
+        for method in ("forward", "of_latent", "probability")
+    ),
 ]
 
 

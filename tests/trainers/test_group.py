@@ -6,14 +6,28 @@ import multiprocessing
 import os
 import signal
 import sys
+import time
+from pathlib import Path
 
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from ls3_torchrl.data import TaggedReplayBuffer
-from ls3_torchrl.trainers import DivergenceError, LS3Options, LS3Trainer, OfflineOptions, OnlineOptions, OptimOptions
+from ls3_torchrl.data import BatchStream, TaggedReplayBuffer
+from ls3_torchrl.modules import GoalEstimator
+from ls3_torchrl.objectives import ClassifierLoss
+from ls3_torchrl.trainers import (
+    DivergenceError,
+    Learner,
+    LearnerGroup,
+    LS3Options,
+    LS3Trainer,
+    OfflineOptions,
+    OnlineOptions,
+    OptimOptions,
+)
 from ls3_torchrl.trainers import group as group_module
+from ls3_torchrl.trainers.together import can_train_together
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
 
@@ -173,3 +187,83 @@ def test_a_learner_whose_random_numbers_are_pytorchs_own_is_trained_here(make_ag
     trainer.train_offline()
     assert forks == [2]
     assert trainer.value.steps == trainer.dynamics.steps == 3
+
+
+def classifiers(buffer, sizes=(16, 16), kind=Learner, sources=None, heads=None):
+    heads = heads or [GoalEstimator(8, hidden=(8,)) for _ in sizes]
+    losses = [ClassifierLoss(head) for head in heads]
+    streams = sources or [BatchStream(buffer, size, reads=loss) for size, loss in zip(sizes, losses, strict=True)]
+    return [kind("goal", *given, lr=1e-2, progress=False) for given in zip(losses, streams, strict=True)]
+
+
+@pytest.fixture
+def buffer(make_agent, episode):
+    filled = TaggedReplayBuffer(100, latent_dim=8)
+    filled.add(episode(success=8), "success")
+    filled.encode(make_agent().encoder)
+    return filled
+
+
+class Own(Learner):
+    def compute_loss(self):
+        return super().compute_loss()
+
+
+def test_learners_take_their_steps_together_where_nothing_forbids_it(buffer):
+    assert can_train_together(classifiers(buffer))
+    assert not can_train_together(classifiers(buffer, sizes=(16, 8)))
+    assert not can_train_together(classifiers(buffer, kind=Own))
+    assert not can_train_together(classifiers(buffer, heads=[GoalEstimator(8)] * 2))
+    assert not can_train_together(classifiers(buffer, sources=[lambda: buffer.sample(16)] * 2))
+    hooked = classifiers(buffer)
+    hooked[0].loss.classifier.network[0].register_forward_hook(lambda *_: None)
+    assert not can_train_together(hooked)
+
+
+def test_a_name_that_does_not_exist_leaves_the_group_as_it_was(buffer):
+    group = LearnerGroup({"goal": classifiers(buffer)[0]})
+    with pytest.raises(KeyError, match="gaol"):
+        group.train([("gaol", 3, "Goal")])
+    group.train([("goal", 3, "Goal")])
+    assert group.learners["goal"].steps == 3
+
+
+def test_a_daemon_trains_by_itself(make_trainer):
+    def train():
+        trainer = make_trainer(2)
+        trainer.train_offline()
+        connection.send(trainer.dynamics.steps)
+
+    context = multiprocessing.get_context("fork")
+    listener, connection = context.Pipe(duplex=False)
+    daemon = context.Process(target=train, daemon=True)
+    daemon.start()
+    assert listener.poll(60)
+    assert listener.recv() == 30
+    daemon.join()
+
+
+def test_a_process_that_has_done_its_work_ends_with_the_one_that_forked_it(buffer):
+    def train():
+        torch.set_num_threads(2)
+        first, second = classifiers(buffer)
+        connection.send(os.getpid())
+        LearnerGroup({"a": first, "b": second}).train([("a", 1, "A"), ("b", 1_000_000, "B")])
+
+    context = multiprocessing.get_context("fork")
+    listener, connection = context.Pipe(duplex=False)
+    parent = context.Process(target=train)
+    parent.start()
+    children = Path(f"/proc/{listener.recv()}/task/{parent.pid}/children")
+    while len(forked := children.read_text().split()) < 2:
+        time.sleep(0.01)
+    time.sleep(1.0)
+    parent.kill()
+    parent.join()
+    for number in forked:
+        status = Path(f"/proc/{number}/status")
+        for _ in range(100):
+            if not status.exists() or "zombie" in status.read_text():
+                break
+            time.sleep(0.1)
+        assert not status.exists() or "zombie" in status.read_text()

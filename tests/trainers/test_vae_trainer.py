@@ -330,3 +330,23 @@ def test_latents_without_a_spread_are_not_divided_by_it(make_agent, filled, epis
     buffer = filled(episode(grey=51))
     with pytest.raises(ValueError, match="All latents are alike"):
         VAETrainer(make_agent(), buffer, VAEOptions(**FAST, unit_scale=True), progress=False).train()
+
+
+def test_weights_that_got_another_order_of_memory_are_the_ones_that_learn(make_agent, filled):
+    agent = make_agent()
+    trainer = VAETrainer(agent, filled(), VAEOptions(**FAST), progress=False)
+    agent.to(memory_format=torch.contiguous_format)
+    before = [weight.detach().clone() for weight in agent.encoder.parameters()]
+    trainer.train()
+    assert all(not torch.equal(new, old) for new, old in zip(agent.encoder.parameters(), before, strict=True))
+
+
+def test_what_is_frozen_stays_and_hooks_are_called(make_agent, filled):
+    agent, seen = make_agent(), []
+    frozen = next(agent.encoder.parameters()).requires_grad_(False)
+    before = frozen.clone()
+    agent.encoder.register_forward_hook(lambda *_: seen.append(1))
+    trainer = VAETrainer(agent, filled(), VAEOptions(**FAST), progress=False)
+    trainer._minimise()
+    assert torch.equal(frozen, before)
+    assert len(seen) == 3
