@@ -8,6 +8,7 @@ import os
 import pickle
 import signal
 import sys
+import threading
 import warnings
 import weakref
 from collections.abc import Callable, Sequence
@@ -52,6 +53,8 @@ class Helpers:
     def __init__(self, function: Callable[..., Any], number: int) -> None:
         context = multiprocessing.get_context("fork")
         self._owner = os.getpid()
+        #: Held while they work: threads of one process must not read each other's answers.
+        self.in_use = threading.Lock()
         self._connections: list[Connection] = []
         processes = []
         for _ in range(number):

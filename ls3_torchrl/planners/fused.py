@@ -224,7 +224,7 @@ class FusedImagination:
             if len(parts) == 1:
                 return [imagine(parts[0])]
             helpers = self._helpers_for(workers)
-            if helpers is None:
+            if helpers is None or not helpers.in_use.acquire(blocking=False):
                 return _in_threads(imagine, parts, workers)
             try:
                 return helpers(self._imagine, parts, job_of)
@@ -238,7 +238,8 @@ class FusedImagination:
                 self._calls = -sys.maxsize
                 return _in_threads(imagine, parts, workers)
             finally:
-                if helpers is not None and not helpers.end.alive:
+                helpers.in_use.release()
+                if not helpers.end.alive:
                     self._helpers = None
 
     def _helpers_for(self, workers: int) -> Helpers | None:

@@ -75,9 +75,10 @@ class Snapshot:
                     "training diverged."
                 )
 
-    def _parameters(self) -> Iterable[nn.Parameter]:
+    def _parameters(self) -> Iterable[Tensor]:
         for module in (self._env.dynamics, self._env.constraint, self._env.goal, self._value, self._safe_set):
             yield from module.parameters()
+            yield from module.buffers()
 
     def refresh(self) -> bool:
         """Copy the layers anew if a parameter changed; return whether it had.

@@ -25,6 +25,8 @@ Chain: TypeAlias = list[Unit]
 _WORTH_A_PROCESS = 200
 #: Seconds between two states of what is trained in other processes, which ``after_step`` is called with.
 _INTERVAL = 2.0
+#: What PyTorch says in a fork of a process whose autograd has threads, as compiled networks make them.
+_AFTER_FORK = "autograd's threading in combination with fork"
 #: How many parameters take as long as the rest of a step.
 _PARAMETERS = 100_000
 #: What a process that is nicer by one gets less of a core it shares: the scheduler's weights are powers of it.
@@ -170,6 +172,8 @@ class LearnerGroup:
                         processes.ask_for_states()
                         last = time.monotonic()
                     continue
+                if _AFTER_FORK in str(report.error):
+                    return  # all is trained here, from before the step that failed
                 bar.update(report.steps)
                 if report.text:
                     bar.set_postfix_str(report.text, refresh=False)

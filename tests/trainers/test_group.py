@@ -166,6 +166,24 @@ def test_what_a_process_that_died_was_training_is_trained_all_the_same(make_trai
     assert_same(aside.state_dict(), alone.state_dict())
 
 
+def test_where_autograd_forbids_forks_learners_are_trained_here(make_trainer, monkeypatch, forks):
+    alone, aside = make_trainer(1), make_trainer(2)
+    here, plain = os.getpid(), torch.Tensor.backward
+
+    def backward(tensor):
+        if os.getpid() != here:
+            raise RuntimeError("Unable to handle autograd's threading in combination with fork-based multiprocessing.")
+        plain(tensor)
+
+    monkeypatch.setattr(torch.Tensor, "backward", backward)
+    for trainer, threads in ((alone, 1), (aside, 2)):
+        torch.set_num_threads(threads)
+        torch.manual_seed(7)
+        trainer.train_offline()
+    assert forks == [3]
+    assert_same(aside.state_dict(), alone.state_dict())
+
+
 class Dropping(torch.nn.Module):
     def __init__(self):
         super().__init__()
