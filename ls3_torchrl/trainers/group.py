@@ -25,7 +25,7 @@ Chain: TypeAlias = list[Unit]
 _WORTH_A_PROCESS = 200
 #: Seconds between two states of what is trained in other processes, which ``after_step`` is called with.
 _INTERVAL = 2.0
-#: What PyTorch says in a fork of a process whose autograd has threads, as compiled networks make them.
+#: What PyTorch says to a gradient in a fork of a process whose autograd has threads.
 _AFTER_FORK = "autograd's threading in combination with fork"
 #: How many parameters take as long as the rest of a step.
 _PARAMETERS = 100_000
