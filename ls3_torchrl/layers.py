@@ -12,6 +12,7 @@ from torch.nn.functional import linear
 from torchrl.modules import MLP
 
 from ls3_torchrl.modules.ensemble import EnsembleMLP
+from ls3_torchrl.modules.relu import relu_
 
 #: A network's layers: weight ``[out, in]`` and bias ``[out]``, ReLU between them.
 Layers = list[tuple[Tensor, Tensor]]
@@ -94,15 +95,6 @@ def run_stacked(x: Tensor, layers: Layers) -> Tensor:
         if i < last:
             x = relu_(x)
     return x
-
-
-def relu_(x: Tensor) -> Tensor:
-    """ReLU in place. NaN in bf16 on a CPU may become 0, as it does in the fused layers."""
-    if x.dtype == torch.bfloat16 and x.device.type == "cpu":
-        # Numbers below zero are integers below zero, and integers are compared four times faster than bf16.
-        x.view(torch.int16).relu_()
-        return x
-    return x.relu_()
 
 
 @lru_cache(maxsize=4)

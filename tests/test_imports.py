@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "agent": {"_checks", "files", "modules", "options", "planners"},
     "trainers": {
         "_checks",
+        "_memory",
         "agent",
         "data",
         "exceptions",

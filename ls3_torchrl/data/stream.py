@@ -35,7 +35,7 @@ class BatchStream:
         reads: its ``in_keys``, as they are when it draws, are what a batch holds.
         extra_keys: entries of the buffer's rows that a batch holds as well.
         members: M for a bootstrap: B transitions drawn independently for each of M members.
-        change: what is made of a batch before it is handed over.
+        change: what is made, row by row, of batches that were drawn at once, ``[K, *batch]``.
 
     Returns:
         From the call: ``[B]``, or ``[B, M]``, or either with K behind for stretches of ``steps=K``.
@@ -80,6 +80,8 @@ class BatchStream:
     def _forget(self) -> None:
         self._generator: torch.Generator | None = None
         self._batches: tuple[TensorDictBase, ...] = ()
+        #: The batches that were drawn at once, ``[K, *batch]``; ``None`` before the first.
+        self.drawn: TensorDictBase | None = None
         self._seen: tuple[Any, ...] | None = None  # of the buffer, when they were drawn
 
     def seed(self, seed: int) -> None:
@@ -96,18 +98,23 @@ class BatchStream:
         if self._generator is not None and (self._taken == len(self._batches) or self._seen != now):
             self._start, self._taken, self._batches = self._generator.get_state(), 0, ()
         while not self._batches:
-            self._batches, self._seen = self._draw(keys), now
+            self.drawn = self._draw(keys)
+            self._batches, self._seen = self.drawn.unbind(0), now
             if self._taken == len(self._batches):  # a state that was taken when all of them were used
                 assert self._generator is not None
                 self._start, self._taken, self._batches = self._generator.get_state(), 0, ()
-        batch = self._batches[self._taken]
         self._taken += 1
-        return batch if self.change is None else self.change(batch.copy())
+        return self._batches[self._taken - 1]
+
+    @property
+    def taken(self) -> int:
+        """How many of the batches that are drawn were handed over."""
+        return self._taken
 
     def _keys(self) -> tuple[tuple[str, ...], ...]:
         return tuple(as_tuple(key) for key in (*self.reads.in_keys, *self.extra_keys))
 
-    def _draw(self, keys: tuple[tuple[str, ...], ...]) -> tuple[TensorDictBase, ...]:
+    def _draw(self, keys: tuple[tuple[str, ...], ...]) -> TensorDictBase:
         """As many batches as fit into so many rows."""
         assert self._start is not None
         self._generator = torch.Generator()
@@ -129,7 +136,7 @@ class BatchStream:
             entry = self._entry(rows, key, index.flatten()).unflatten(0, index.shape)
             # In memory a member's rows lie together, as its network reads them.
             batch.set(key, entry if self.members is None else entry.transpose(1, 2))
-        return batch.unbind(0)
+        return batch if self.change is None else self.change(batch)
 
     def _entry(self, rows: TensorDictBase, key: tuple[str, ...], index: Tensor) -> Tensor:
         """An entry of rows, a latent drawn afresh."""
@@ -150,4 +157,4 @@ class BatchStream:
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is drawn ahead, and the generator, which cannot be copied; both are made again."""
-        return vars(self) | {"_generator": None, "_batches": (), "_seen": None}
+        return vars(self) | {"_generator": None, "_batches": (), "drawn": None, "_seen": None}

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ls3_torchrl._checks import require_at_least
+from ls3_torchrl.modules.relu import relu_
 
 
 class EnsembleMLP(nn.Module):
@@ -84,7 +85,7 @@ def run_stacked(inputs: Tensor, layers: Sequence[tuple[Tensor, Tensor]]) -> Tens
     *hidden_layers, (weight, bias) = layers
     hidden = inputs
     for hidden_weight, hidden_bias in hidden_layers:
-        hidden = torch.baddbmm(hidden_bias, hidden, hidden_weight).relu_()
+        hidden = relu_(torch.baddbmm(hidden_bias, hidden, hidden_weight))
     if not torch.is_autocast_enabled(hidden.device.type):
         return torch.baddbmm(bias, hidden, weight)
     with torch.autocast(hidden.device.type, enabled=False):

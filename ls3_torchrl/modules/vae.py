@@ -19,6 +19,7 @@ from torchrl.modules import NormalParamExtractor
 
 from ls3_torchrl._checks import require_at_least, require_finite, require_keys, require_positive
 from ls3_torchrl.modules.convolutions import FastConv2d, FastConvTranspose2d
+from ls3_torchrl.modules.relu import FastReLU
 
 IMAGE_SIZE = 64
 _FEATURES = 256
@@ -67,13 +68,13 @@ class _ConvolutionalPosterior(nn.Module):
         # Hafner et al.'s encoder with stride 3 in the second layer: 64 -> 31 -> 10 -> 4 -> 1.
         self.convolutions = nn.Sequential(
             nn.Conv2d(in_channels, 32, 4, stride=2),
-            nn.ReLU(inplace=True),
+            FastReLU(),
             nn.Conv2d(32, 64, 4, stride=3),
-            nn.ReLU(inplace=True),
+            FastReLU(),
             FastConv2d(64, 128, 4, stride=2),
-            nn.ReLU(inplace=True),
+            FastReLU(),
             FastConv2d(128, _FEATURES, 4, stride=2),
-            nn.ReLU(inplace=True),
+            FastReLU(),
             nn.Flatten(),
         )
         self.head = nn.Linear(_FEATURES, 2 * latent_dim)
@@ -225,11 +226,11 @@ class PixelDecoder(TensorDictModuleBase):
             nn.Linear(latent_dim, _FEATURES),
             nn.Unflatten(-1, (_FEATURES, 1, 1)),
             FastConvTranspose2d(_FEATURES, 128, 5, stride=2),
-            nn.ReLU(inplace=True),
+            FastReLU(),
             FastConvTranspose2d(128, 64, 5, stride=2),
-            nn.ReLU(inplace=True),
+            FastReLU(),
             FastConvTranspose2d(64, 32, 6, stride=2),
-            nn.ReLU(inplace=True),
+            FastReLU(),
             FastConvTranspose2d(32, out_channels, 6, stride=2),
         )
         self.background: Tensor | None

@@ -14,9 +14,10 @@ from ls3_torchrl._checks import require_labels, require_unit_interval
 from ls3_torchrl.modules.call import call_on_latent
 from ls3_torchrl.objectives.base import require_shape_of
 from ls3_torchrl.objectives.head import HeadLoss
+from ls3_torchrl.objectives.lagged import LaggedTargetLoss
 
 
-class SafeSetLoss(HeadLoss):
+class SafeSetLoss(HeadLoss, LaggedTargetLoss):
     """Binary cross-entropy of f_S(z_t) to max(1_S(z_t), γ_S f_S'(z_{t+1})) (equation (5)).
 
     Rows may carry a weight under ``weight``; those of a trajectory that neither succeeded nor violated, say, tell
@@ -58,16 +59,19 @@ class SafeSetLoss(HeadLoss):
             next_latent (NestedKey): z_{t+1}.
             in_success (NestedKey): 1_S(z_t), the state is part of a trajectory that still succeeds.
             weight (NestedKey): weight of each row in the mean, optional.
+            safe_set_target (NestedKey): what f_S(z_t) is compared with; computed where a batch lacks it.
         """
 
         latent: NestedKey = "latent"
         next_latent: NestedKey = ("next", "latent")
         in_success: NestedKey = "in_success"
         weight: NestedKey = "safe_set_weight"
+        safe_set_target: NestedKey = "safe_set_target"
 
-    _optional = frozenset({"weight"})
+    _optional = frozenset({"weight", "safe_set_target"})
 
     head = "safe_set"
+    target_name = "safe_set_target"
     safe_set: TensorDictModuleBase
     safe_set_params: TensorDictParams
     target_safe_set_params: TensorDictParams
@@ -86,10 +90,21 @@ class SafeSetLoss(HeadLoss):
         require_labels(in_success, self.tensor_keys.in_success)
         return torch.maximum(in_success.to(next_safe), self.gamma * next_safe)
 
+    def targets(self, tensordict: TensorDictBase) -> Tensor:
+        """:meth:`target` of transitions."""
+        keys = self.tensor_keys
+        return self.target(tensordict.get(keys.next_latent), tensordict.get(keys.in_success))
+
+    @property
+    def has_targets_by_row(self) -> bool:
+        """Whether the safe set is a network of this library, and nobody else is told when it is called."""
+        return type(self) is SafeSetLoss and self.relu_layers() is not None
+
     def losses_of(self, logit: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The loss of logits ``[B, 1]`` on transitions ``[B]``."""
         keys = self.tensor_keys
-        target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.in_success))
+        target = self.targets_of(tensordict)
+        require_shape_of(target, logit, keys.safe_set_target, "SafeSetLoss")
         weight = tensordict.get(keys.weight, None)
         if weight is not None:
             require_shape_of(weight, logit, keys.weight, "SafeSetLoss")

@@ -11,8 +11,10 @@ from torch import Tensor
 from torchrl.objectives.value.functional import td0_return_estimate
 
 from ls3_torchrl._checks import require_unit_interval
-from ls3_torchrl.modules.call import call_on_latent
+from ls3_torchrl.modules import ValueEnsemble
+from ls3_torchrl.modules.call import call_on_latent, is_hooked
 from ls3_torchrl.objectives.base import LatentLoss, check_members, require_ensemble, with_members
+from ls3_torchrl.objectives.lagged import LaggedTargetLoss
 
 
 class OfflineValueLoss(LatentLoss):
@@ -76,7 +78,7 @@ class OfflineValueLoss(LatentLoss):
         return {"loss_value": (value - target).square().mean()}
 
 
-class TD1ValueLoss(LatentLoss):
+class TD1ValueLoss(LaggedTargetLoss):
     """J(θ) = (V_θ(z_t) − (r_t + γ V_θ'(z_{t+1})))² with a lagged target θ' (equation (4)).
 
     No ``done`` mask: episodes end only by the horizon (section 1.1.1). Each member bootstraps from its own
@@ -124,13 +126,16 @@ class TD1ValueLoss(LatentLoss):
             next_latent (NestedKey): z_{t+1}.
             reward (NestedKey): r_t, the reward of the step from t.
             reward_to_go (NestedKey): Σ_{i≥0} γ^i r_{t+i}, read with ``monte_carlo`` alone.
+            value_target (NestedKey): what V_θ(z_t) is compared with; computed where a batch lacks it.
         """
 
         latent: NestedKey = "latent"
         next_latent: NestedKey = ("next", "latent")
         reward: NestedKey = ("next", "reward")
         reward_to_go: NestedKey = "reward_to_go"
+        value_target: NestedKey = "value_target"
 
+    target_name = "value_target"
     value: TensorDictModuleBase
     value_params: TensorDictParams
     target_value_params: TensorDictParams
@@ -153,7 +158,7 @@ class TD1ValueLoss(LatentLoss):
         self.zero_at_goal = zero_at_goal
         self.monte_carlo = monte_carlo
         self.bootstrap = bootstrap
-        self._optional = frozenset() if monte_carlo else frozenset({"reward_to_go"})
+        self._optional = frozenset({"value_target"} if monte_carlo else {"value_target", "reward_to_go"})
 
     def _values(self, latent: Tensor, which: str) -> Tensor:
         options = {"per_member": True} if self.bootstrap else {}
@@ -168,14 +173,26 @@ class TD1ValueLoss(LatentLoss):
         target = td0_return_estimate(self.gamma, next_value, reward, terminated=never)
         return torch.where(reward == 0, torch.zeros_like(target), target) if self.zero_at_goal else target
 
+    def targets(self, tensordict: TensorDictBase) -> Tensor:
+        """:meth:`target` of transitions, at least the return that was seen with ``monte_carlo``."""
+        keys = self.tensor_keys
+        target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.reward))
+        if not self.monte_carlo:
+            return target
+        return torch.maximum(target, with_members(tensordict.get(keys.reward_to_go), target, "TD1ValueLoss"))
+
+    @property
+    def has_targets_by_row(self) -> bool:
+        """Whether the value is an ensemble of this library, and nobody else is told when it is called."""
+        ours = type(self) is TD1ValueLoss and type(self.value) is ValueEnsemble
+        return ours and not any(is_hooked(part) for part in self.value.modules())
+
     def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The loss on transitions ``[B]``, or ``[B, M]`` with ``bootstrap``."""
-        keys = self.tensor_keys
-        latent = tensordict.get(keys.latent)
+        latent = tensordict.get(self.tensor_keys.latent)
         if self.bootstrap:
             check_members(latent, self.value, "TD1ValueLoss")
-        target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.reward))
-        if self.monte_carlo:
-            target = torch.maximum(target, with_members(tensordict.get(keys.reward_to_go), target, "TD1ValueLoss"))
+        target = self.targets_of(tensordict)
         value = self._values(latent, "value")
+        target = with_members(target, value, "TD1ValueLoss")
         return {"loss_value": (value - target).square().mean()}

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ls3_torchrl.layers import relu_, run_layers, run_stacked
+from ls3_torchrl.layers import run_layers, run_stacked
 from ls3_torchrl.modules.dynamics import EnsembleDynamics
+from ls3_torchrl.modules.relu import relu_
 from ls3_torchrl.planners.snapshot import Snapshot
 
 

@@ -15,11 +15,14 @@ from torch.nn.utils import get_total_norm
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.record.loggers import Logger
 
+from ls3_torchrl._memory import keep_freed_memory
 from ls3_torchrl.data import BatchStream
 from ls3_torchrl.exceptions import DivergenceError
 from ls3_torchrl.layers import fastest_precision
 from ls3_torchrl.objectives.base import LatentLoss
+from ls3_torchrl.objectives.lagged import LaggedTargetLoss
 from ls3_torchrl.options.training import Autocast
+from ls3_torchrl.trainers.lagged_targets import LaggedTargets
 from ls3_torchrl.trainers.progress import Bar, progress_bar
 
 #: Gradient steps between logged metrics.
@@ -154,6 +157,7 @@ class Learner:
         self.optimizer = torch.optim.Adam(self.parameters, lr=lr, fused=True) if self.parameters else None
         self.target_interval, self.tau = target_interval, tau
         self.target: HardUpdate | SoftUpdate | None = None
+        self._lagged_targets: LaggedTargets | None = None  # of the phase that it is in
         self.steps = 0
         self._phase_steps = 0  # of the phase that train() is in; kept for one that continues in the middle
         self._phase: tuple[int, str] | None = None  # that phase
@@ -200,6 +204,8 @@ class Learner:
     def new_batch(self) -> TensorDictBase:
         """The next batch, where the parameters are."""
         self._batch = self._as_parameters(self.sample())
+        if self._lagged_targets is not None and isinstance(self.target, HardUpdate):
+            self._lagged_targets.add_to(self._batch, self.target.counter)
         return self._batch
 
     def autocast(self) -> torch.autocast:
@@ -289,7 +295,22 @@ class Learner:
                 stream.seed(new_seed(own))
         self._phase = (steps, phase)
         self._require_one_precision()
+        keep_freed_memory()
         self._make_target()
+        self._lagged_targets = self._targets_ahead()
+
+    def _targets_ahead(self) -> LaggedTargets | None:
+        """Targets for many batches at once, where the lagged network moves now and then alone."""
+        if self.target_interval is None or self.tau is not None:
+            return None
+        if not (isinstance(self.loss, LaggedTargetLoss) and isinstance(self.sample, BatchStream)):
+            return None
+        return LaggedTargets(self.loss, self.sample, self.target_interval, self._compute_targets)
+
+    def _compute_targets(self, rows: TensorDictBase) -> Tensor:
+        assert isinstance(self.loss, LaggedTargetLoss)
+        with self.autocast():
+            return self.loss.targets(self._as_parameters(rows))
 
     def _require_one_precision(self) -> None:
         kinds = {
@@ -337,7 +358,7 @@ class Learner:
 
     def end(self) -> None:
         """End a phase."""
-        self._phase_steps, self._phase = 0, None
+        self._phase_steps, self._phase, self._lagged_targets = 0, None, None
 
     def divergence(self, losses: Mapping[str, Tensor]) -> DivergenceError:
         """The error that the step which is not taken ends with."""

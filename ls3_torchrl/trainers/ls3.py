@@ -204,18 +204,22 @@ class LS3Trainer:
             change=self._label_failures,
         )
 
-    def _label_failures(self, rows: TensorDictBase) -> TensorDictBase:
+    def _label_failures(self, batches: TensorDictBase) -> TensorDictBase:
+        rows = batches
         if self.options.loss.failure_rows == "violating":
-            shape, rows = rows.shape, rows.flatten()
-            found = rows[self.buffer.keys.constraint].flatten().nonzero().flatten()
-            if len(found):
-                # Those that were found stand in for the others: the batch keeps its size.
-                rows = rows[found[torch.arange(len(rows), device=found.device) % len(found)]]
-                rows.set("latent", rows["next", "latent"])
-            rows = rows.reshape(shape)
+            rows = torch.stack([self._violating(batch) for batch in batches.unbind(0)])
         if self._failure_value is None:
             self._failure_value = self._make_failure_value()
         return rows.set("reward_to_go", torch.full_like(rows["reward_to_go"], self._failure_value))
+
+    def _violating(self, batch: TensorDictBase) -> TensorDictBase:
+        """Those states of a batch that violate, in its size: they stand in for the others."""
+        rows = batch.flatten()
+        found = rows[self.buffer.keys.constraint].flatten().nonzero().flatten()
+        if len(found):
+            rows = rows[found[torch.arange(len(rows), device=found.device) % len(found)]]
+            rows.set("latent", rows["next", "latent"])
+        return rows.reshape(batch.shape)
 
     def _weigh(self, rows: TensorDictBase) -> TensorDictBase:
         """Rows for equation (5): how much online episodes that timed out count is an option."""

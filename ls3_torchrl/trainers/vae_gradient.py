@@ -98,9 +98,9 @@ class VAEGradient:
     def _part(self, batch: TensorDictBase, noise: Tensor, weight: float, share: float) -> _Computed:
         """The losses of a part of a batch times its share in it, and the gradients of their sum."""
         with torch.autocast(noise.device.type, torch.bfloat16, enabled=self.bf16, cache_enabled=False):
-            images = batch.get(self.observation)
-            target = batch.get(TARGET, images)
-            given = batch.get(INPUT, target)
+            images = _channels_last(batch.get(self.observation))
+            target = _channels_last(batch.get(TARGET, images))
+            given = _channels_last(batch.get(INPUT, target))
             predicts = self.prediction is not None and weight
             pair: tuple[Tensor, ...] = ()
             if not predicts:
@@ -143,6 +143,11 @@ class VAEGradient:
                 leaf.grad = total.copy_(gradients[0])
             elif gradients:
                 leaf.grad = torch.add(*gradients, out=total)
+
+
+def _channels_last(images: Tensor) -> Tensor:
+    """Images in the convolutions' order of memory, which is that of encoder and target alike."""
+    return images.contiguous(memory_format=torch.channels_last) if images.ndim == 4 else images
 
 
 def in_memory_order(tensor: Tensor) -> Tensor:

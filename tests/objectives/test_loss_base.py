@@ -67,7 +67,15 @@ each_loss = pytest.mark.parametrize("make", LOSSES.values(), ids=LOSSES)
 def batch_of(loss: LossModule, *, optional: bool = True) -> TensorDict:
     """A batch of what the loss reads, under the keys that it has now."""
     flags = {"label", "in_success", "constraint"}
-    sizes = {"action": A, "reward": 1, "reward_to_go": 1, "weight": 1, **dict.fromkeys(flags, 1)}
+    sizes = {
+        "action": A,
+        "reward": 1,
+        "reward_to_go": 1,
+        "weight": 1,
+        "value_target": 1,
+        "safe_set_target": 1,
+        **dict.fromkeys(flags, 1),
+    }
     batch = TensorDict({}, [B])
     for name, key in vars(loss.tensor_keys).items():
         if key is None or name in loss._written or (name in loss._optional and not optional):

@@ -1,0 +1,50 @@
+"""ReLU in bf16 by integers: the same numbers and gradients as PyTorch's, special ones included."""
+
+import pytest
+import torch
+from torch import nn
+
+from ls3_torchrl.modules.relu import FastReLU, relu_
+
+SPECIAL = [0.0, -0.0, 1e-40, -1e-40, float("inf"), -float("inf"), 3.0, -3.0]
+
+
+def numbers(dtype: torch.dtype) -> torch.Tensor:
+    torch.manual_seed(0)
+    return torch.cat([torch.tensor(SPECIAL), torch.randn(8 * 3 * 4 * 4 - len(SPECIAL))]).to(dtype).view(8, 3, 4, 4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
+def test_it_and_its_gradient_are_relus(dtype, memory_format):
+    found = []
+    for relu in (FastReLU(), nn.ReLU(inplace=True)):
+        x = numbers(dtype).contiguous(memory_format=memory_format).requires_grad_()
+        before = x * 1
+        out = relu(before)
+        assert out.data_ptr() == before.data_ptr()
+        (gradient,) = torch.autograd.grad(out, x, torch.linspace(-1, 1, x.numel()).to(dtype).view_as(x))
+        found.append((out.detach(), gradient))
+    assert all(torch.equal(ours, theirs) for ours, theirs in zip(*found, strict=True))
+    assert torch.equal(relu_(numbers(dtype)), found[0][0])  # without a gradient as well
+
+
+def test_a_gradient_of_another_dtype_is_kept():
+    x = numbers(torch.bfloat16).requires_grad_()
+    with torch.autocast("cpu", torch.bfloat16):
+        relu_(x * 1).float().square().sum().backward()
+    assert torch.equal(x.grad, 2 * numbers(torch.bfloat16).relu())
+
+
+def test_a_positive_nan_stays_and_stops_training():
+    x = torch.tensor([float("nan"), 1.0], dtype=torch.bfloat16, requires_grad=True)
+    out = relu_(x * 1)
+    assert out.isnan().tolist() == [True, False]
+    (gradient,) = torch.autograd.grad(out.sum(), x)
+    assert gradient.tolist() == [1.0, 1.0]
+
+
+def test_it_compiles_in_one_graph():
+    made = torch.compile(lambda x: relu_(x * 2).sum(), fullgraph=True, backend="eager")
+    x = numbers(torch.bfloat16).nan_to_num(0, 1, -1)
+    assert made(x) == relu_(x * 2).sum()
