@@ -12,14 +12,15 @@ from torch.nn import Parameter
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.modules.dropout import _DropoutNd
 
+from ls3_torchrl.data.augment import resized_crop
 from ls3_torchrl.halves import Halves
 from ls3_torchrl.modules import EnsembleDynamics, PixelDecoder, PixelEncoder
 from ls3_torchrl.modules.call import encode, is_hooked
 from ls3_torchrl.modules.vae import as_unit_pixels
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
 
-#: Where a batch holds images to reconstruct, and what the encoder sees of them, if not the images as they are.
-TARGET, INPUT = "vae_target", "vae_input"
+#: Where a batch holds images to reconstruct, if not the images as they are, and which part of them the encoder sees.
+TARGET, CROP = "vae_target", "vae_crop"
 _Computed = tuple[dict[str, Tensor], tuple[Tensor | None, ...]]
 
 
@@ -97,10 +98,11 @@ class VAEGradient:
 
     def _part(self, batch: TensorDictBase, noise: Tensor, weight: float, share: float) -> _Computed:
         """The losses of a part of a batch times its share in it, and the gradients of their sum."""
+        images = _channels_last(batch.get(self.observation))
+        target = _channels_last(batch.get(TARGET, images))
+        crops = batch.get(CROP, None)
+        given = target if crops is None else _channels_last(resized_crop(target, crops))
         with torch.autocast(noise.device.type, torch.bfloat16, enabled=self.bf16, cache_enabled=False):
-            images = _channels_last(batch.get(self.observation))
-            target = _channels_last(batch.get(TARGET, images))
-            given = _channels_last(batch.get(INPUT, target))
             predicts = self.prediction is not None and weight
             pair: tuple[Tensor, ...] = ()
             if not predicts:

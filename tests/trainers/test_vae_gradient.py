@@ -7,10 +7,11 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
+from ls3_torchrl.data.augment import random_crops, resized_crop
 from ls3_torchrl.halves import Halves
 from ls3_torchrl.modules import EnsembleDynamics, PixelDecoder, PixelEncoder
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
-from ls3_torchrl.trainers.vae_gradient import INPUT, TARGET, VAEGradient, in_memory_order
+from ls3_torchrl.trainers.vae_gradient import CROP, TARGET, VAEGradient, in_memory_order
 
 D = 4
 
@@ -29,7 +30,7 @@ def images(count):
 def batch_of(size, *, crop=False):
     rows = {"pixels": images(size), "action": torch.randn(size, 2), "next": {"pixels": images(size)}}
     if crop:
-        rows |= {TARGET: images(size), INPUT: torch.rand(size, 3, 64, 64)}
+        rows |= {TARGET: images(size), CROP: random_crops(size, scale=(0.5, 0.9))}
     return TensorDict(rows, [size])
 
 
@@ -64,7 +65,7 @@ def test_halves_have_the_whole_batchs_losses_and_gradient(size, crop, reduction)
     gradient = gradient_of(made, reduction=reduction)
     losses, found = computed(gradient, batch, noise, weight, 2)
     # By the losses as they are called elsewhere, which encode every image by themselves.
-    seen = batch.get(INPUT, batch["pixels"])
+    seen = resized_crop(batch[TARGET], batch[CROP]) if crop else batch["pixels"]
     loc, scale = made[0].of_pixels(seen)
     whole = gradient.loss.of_posterior(loc, scale, batch.get(TARGET, batch["pixels"]) / 255.0, noise=noise)
     prediction = gradient.prediction(batch)["loss_prediction"]
