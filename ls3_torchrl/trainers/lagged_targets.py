@@ -10,6 +10,9 @@ from torch import Tensor
 from ls3_torchrl.data import BatchStream
 from ls3_torchrl.objectives.lagged import LaggedTargetLoss
 
+#: Rows that are computed at once: enough for fast products, and few enough to stay in a core's cache.
+_ROWS = 8192
+
 
 class LaggedTargets:
     """Gives each batch of a stream the targets that a loss would compute for it.
@@ -52,6 +55,11 @@ class LaggedTargets:
             self._drawn, self._first, self._targets = drawn, first, ()
             if self._loss.is_plain and self._loss.has_targets_by_row:
                 rows = drawn[first : number - steps + self._interval]
-                self._targets = self._compute(rows.flatten(0, 1)).unflatten(0, rows.shape[:2]).unbind(0)
+                together = max(1, _ROWS // rows[0].numel())
+                self._targets = tuple(target for part in rows.split(together) for target in self._of(part))
         if self._targets:
             batch.set(self._loss.target_key, self._targets[number - first])
+
+    def _of(self, batches: TensorDictBase) -> tuple[Tensor, ...]:
+        """Those of batches ``[K, *batch]``."""
+        return self._compute(batches.flatten(0, 1)).unflatten(0, batches.shape[:2]).unbind(0)
