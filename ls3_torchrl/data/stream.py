@@ -35,7 +35,7 @@ class BatchStream:
         reads: its ``in_keys``, as they are when it draws, are what a batch holds.
         extra_keys: entries of the buffer's rows that a batch holds as well.
         members: M for a bootstrap: B transitions drawn independently for each of M members.
-        change: what is made, row by row, of batches that were drawn at once, ``[K, *batch]``.
+        change: what is made of batches ``[K, *batch]`` when they are drawn, all at once; it keeps their shape.
 
     Returns:
         From the call: ``[B]``, or ``[B, M]``, or either with K behind for stretches of ``steps=K``.

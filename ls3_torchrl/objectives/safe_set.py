@@ -59,19 +59,19 @@ class SafeSetLoss(HeadLoss, LaggedTargetLoss):
             next_latent (NestedKey): z_{t+1}.
             in_success (NestedKey): 1_S(z_t), the state is part of a trajectory that still succeeds.
             weight (NestedKey): weight of each row in the mean, optional.
-            safe_set_target (NestedKey): what f_S(z_t) is compared with; computed where a batch lacks it.
+            lagged_safe_set_target (NestedKey): what f_S(z_t) is compared with; computed where a batch lacks it.
         """
 
         latent: NestedKey = "latent"
         next_latent: NestedKey = ("next", "latent")
         in_success: NestedKey = "in_success"
         weight: NestedKey = "safe_set_weight"
-        safe_set_target: NestedKey = "safe_set_target"
+        lagged_safe_set_target: NestedKey = "lagged_safe_set_target"
 
-    _optional = frozenset({"weight", "safe_set_target"})
+    _optional = frozenset({"weight", "lagged_safe_set_target"})
 
     head = "safe_set"
-    target_name = "safe_set_target"
+    target_name, lagged = "lagged_safe_set_target", "safe_set"
     safe_set: TensorDictModuleBase
     safe_set_params: TensorDictParams
     target_safe_set_params: TensorDictParams
@@ -96,6 +96,11 @@ class SafeSetLoss(HeadLoss, LaggedTargetLoss):
         return self.target(tensordict.get(keys.next_latent), tensordict.get(keys.in_success))
 
     @property
+    def target_settings(self) -> tuple[float, ...]:
+        """γ_S."""
+        return (self.gamma,)
+
+    @property
     def has_targets_by_row(self) -> bool:
         """Whether the safe set is a network of this library, and nobody else is told when it is called."""
         return type(self) is SafeSetLoss and self.relu_layers() is not None
@@ -103,8 +108,8 @@ class SafeSetLoss(HeadLoss, LaggedTargetLoss):
     def losses_of(self, logit: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The loss of logits ``[B, 1]`` on transitions ``[B]``."""
         keys = self.tensor_keys
-        target = self.targets_of(tensordict)
-        require_shape_of(target, logit, keys.safe_set_target, "SafeSetLoss")
+        target = self.given_or_computed_targets(tensordict)
+        require_shape_of(target, logit, self.target_key, "SafeSetLoss")
         weight = tensordict.get(keys.weight, None)
         if weight is not None:
             require_shape_of(weight, logit, keys.weight, "SafeSetLoss")

@@ -13,6 +13,7 @@ from torchrl.objectives.value.functional import td0_return_estimate
 from ls3_torchrl._checks import require_unit_interval
 from ls3_torchrl.modules import ValueEnsemble
 from ls3_torchrl.modules.call import call_on_latent, is_hooked
+from ls3_torchrl.modules.ensemble import EnsembleMLP
 from ls3_torchrl.objectives.base import LatentLoss, check_members, require_ensemble, with_members
 from ls3_torchrl.objectives.lagged import LaggedTargetLoss
 
@@ -126,16 +127,16 @@ class TD1ValueLoss(LaggedTargetLoss):
             next_latent (NestedKey): z_{t+1}.
             reward (NestedKey): r_t, the reward of the step from t.
             reward_to_go (NestedKey): Σ_{i≥0} γ^i r_{t+i}, read with ``monte_carlo`` alone.
-            value_target (NestedKey): what V_θ(z_t) is compared with; computed where a batch lacks it.
+            lagged_value_target (NestedKey): what V_θ(z_t) is compared with; computed where a batch lacks it.
         """
 
         latent: NestedKey = "latent"
         next_latent: NestedKey = ("next", "latent")
         reward: NestedKey = ("next", "reward")
         reward_to_go: NestedKey = "reward_to_go"
-        value_target: NestedKey = "value_target"
+        lagged_value_target: NestedKey = "lagged_value_target"
 
-    target_name = "value_target"
+    target_name, lagged = "lagged_value_target", "value"
     value: TensorDictModuleBase
     value_params: TensorDictParams
     target_value_params: TensorDictParams
@@ -158,7 +159,7 @@ class TD1ValueLoss(LaggedTargetLoss):
         self.zero_at_goal = zero_at_goal
         self.monte_carlo = monte_carlo
         self.bootstrap = bootstrap
-        self._optional = frozenset({"value_target"} if monte_carlo else {"value_target", "reward_to_go"})
+        self._optional = frozenset({"lagged_value_target"} if monte_carlo else {"lagged_value_target", "reward_to_go"})
 
     def _values(self, latent: Tensor, which: str) -> Tensor:
         options = {"per_member": True} if self.bootstrap else {}
@@ -182,9 +183,15 @@ class TD1ValueLoss(LaggedTargetLoss):
         return torch.maximum(target, with_members(tensordict.get(keys.reward_to_go), target, "TD1ValueLoss"))
 
     @property
+    def target_settings(self) -> tuple[float, ...]:
+        """γ, and which targets are changed."""
+        return self.gamma, self.zero_at_goal, self.monte_carlo
+
+    @property
     def has_targets_by_row(self) -> bool:
         """Whether the value is an ensemble of this library, and nobody else is told when it is called."""
-        ours = type(self) is TD1ValueLoss and type(self.value) is ValueEnsemble
+        value = self.value
+        ours = type(self) is TD1ValueLoss and type(value) is ValueEnsemble and type(value.network) is EnsembleMLP
         return ours and not any(is_hooked(part) for part in self.value.modules())
 
     def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
@@ -192,7 +199,7 @@ class TD1ValueLoss(LaggedTargetLoss):
         latent = tensordict.get(self.tensor_keys.latent)
         if self.bootstrap:
             check_members(latent, self.value, "TD1ValueLoss")
-        target = self.targets_of(tensordict)
+        target = self.given_or_computed_targets(tensordict)
         value = self._values(latent, "value")
         target = with_members(target, value, "TD1ValueLoss")
         return {"loss_value": (value - target).square().mean()}

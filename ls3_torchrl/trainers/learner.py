@@ -204,8 +204,10 @@ class Learner:
     def new_batch(self) -> TensorDictBase:
         """The next batch, where the parameters are."""
         self._batch = self._as_parameters(self.sample())
-        if self._lagged_targets is not None and isinstance(self.target, HardUpdate):
-            self._lagged_targets.add_to(self._batch, self.target.counter)
+        ahead = self._lagged_targets
+        if ahead is not None and ahead.batches is self.sample and isinstance(self.target, HardUpdate):
+            assert self._phase is not None
+            ahead.add_to(self._batch, self.target.counter, self._phase[0] - self._phase_steps)
         return self._batch
 
     def autocast(self) -> torch.autocast:
@@ -303,7 +305,7 @@ class Learner:
         """Targets for many batches at once, where the lagged network moves now and then alone."""
         if self.target_interval is None or self.tau is not None:
             return None
-        if not (isinstance(self.loss, LaggedTargetLoss) and isinstance(self.sample, BatchStream)):
+        if not isinstance(self.loss, LaggedTargetLoss) or type(self.sample) is not BatchStream:
             return None
         return LaggedTargets(self.loss, self.sample, self.target_interval, self._compute_targets)
 

@@ -98,10 +98,10 @@ class VAEGradient:
 
     def _part(self, batch: TensorDictBase, noise: Tensor, weight: float, share: float) -> _Computed:
         """The losses of a part of a batch times its share in it, and the gradients of their sum."""
-        images = _channels_last(batch.get(self.observation))
-        target = _channels_last(batch.get(TARGET, images))
+        images = self._in_order(batch.get(self.observation))
+        target = self._in_order(batch.get(TARGET, images))
         crops = batch.get(CROP, None)
-        given = target if crops is None else _channels_last(resized_crop(target, crops))
+        given = target if crops is None else self._in_order(resized_crop(target, crops))
         with torch.autocast(noise.device.type, torch.bfloat16, enabled=self.bf16, cache_enabled=False):
             predicts = self.prediction is not None and weight
             pair: tuple[Tensor, ...] = ()
@@ -126,6 +126,11 @@ class VAEGradient:
         gradients = torch.autograd.grad(share * total, self.parameters, allow_unused=True)
         return {name: share * value.detach() for name, value in (found | {"sum": total}).items()}, gradients
 
+    def _in_order(self, images: Tensor) -> Tensor:
+        """Images in the order of memory that the convolutions compute in: channels last."""
+        ours = type(self.loss.encoder) is PixelEncoder and type(self.loss.decoder) is PixelDecoder
+        return images.contiguous(memory_format=torch.channels_last) if ours and images.ndim == 4 else images
+
     def _next(self, batch: TensorDictBase) -> Tensor:
         assert self.prediction is not None
         return batch.get(self.prediction.tensor_keys.next_pixels)
@@ -145,11 +150,6 @@ class VAEGradient:
                 leaf.grad = total.copy_(gradients[0])
             elif gradients:
                 leaf.grad = torch.add(*gradients, out=total)
-
-
-def _channels_last(images: Tensor) -> Tensor:
-    """Images in the convolutions' order of memory, which is that of encoder and target alike."""
-    return images.contiguous(memory_format=torch.channels_last) if images.ndim == 4 else images
 
 
 def in_memory_order(tensor: Tensor) -> Tensor:

@@ -1,8 +1,9 @@
-"""ReLU in bf16 by integers: the same numbers and gradients as PyTorch's, special ones included."""
+"""ReLU in bf16: the same numbers and derivatives as PyTorch's, special ones included."""
 
 import pytest
 import torch
 from torch import nn
+from torch.autograd import forward_ad
 
 from ls3_torchrl.modules.relu import FastReLU, relu_
 
@@ -48,3 +49,42 @@ def test_it_compiles_in_one_graph():
     made = torch.compile(lambda x: relu_(x * 2).sum(), fullgraph=True, backend="eager")
     x = numbers(torch.bfloat16).nan_to_num(0, 1, -1)
     assert made(x) == relu_(x * 2).sum()
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:FutureWarning")  # PyTorch's own, in jvp
+def test_derivatives_of_every_kind_are_relus():
+    x, tangent = numbers(torch.bfloat16).nan_to_num(0, 1, -1), torch.ones(8, 3, 4, 4).bfloat16()
+
+    def ours(x):
+        return relu_(x * 2).square()
+
+    def theirs(x):
+        return (x * 2).relu_().square()
+
+    kinds = {
+        "jvp": lambda f: torch.func.jvp(f, (x,), (tangent,)),
+        "vjp": lambda f: torch.func.vjp(f, x)[1](tangent),
+        "vmapped gradient": lambda f: torch.func.vmap(torch.func.grad(lambda row: f(row).sum()))(x),
+        "hessian": lambda f: torch.func.hessian(lambda row: f(row).sum())(x[0, 0, 0]),
+        "many gradients": lambda f: torch.autograd.functional.jacobian(f, x[0, 0, 0], vectorize=True),
+        "gradient of the gradient": lambda f: second_derivative(f, x),
+        "forward": lambda f: forward_derivative(f, x, tangent),
+    }
+    for name, kind in kinds.items():
+        for mine, its in zip(flat(kind(ours)), flat(kind(theirs)), strict=True):
+            assert torch.equal(mine, its), name
+
+
+def second_derivative(f, x):
+    x = x.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(f(x).sum(), x, create_graph=True)
+    return torch.autograd.grad(gradient.square().sum(), x)[0]
+
+
+def forward_derivative(f, x, tangent):
+    with forward_ad.dual_level():
+        return forward_ad.unpack_dual(f(forward_ad.make_dual(x, tangent))).tangent.clone()
+
+
+def flat(found):
+    return [part for one in found for part in flat(one)] if isinstance(found, tuple) else [found]

@@ -72,8 +72,8 @@ def batch_of(loss: LossModule, *, optional: bool = True) -> TensorDict:
         "reward": 1,
         "reward_to_go": 1,
         "weight": 1,
-        "value_target": 1,
-        "safe_set_target": 1,
+        "lagged_value_target": 1,
+        "lagged_safe_set_target": 1,
         **dict.fromkeys(flags, 1),
     }
     batch = TensorDict({}, [B])
