@@ -12,8 +12,8 @@ from torchrl.modules import MLP
 from ls3_torchrl.agent import LS3Agent
 from ls3_torchrl.data import EpisodeKeys
 from ls3_torchrl.modules.call import encode
-from ls3_torchrl.trainers.learner import threads
 from ls3_torchrl.trainers.progress import progress_bar
+from ls3_torchrl.trainers.steps import threads
 
 _BATCH, _LR = 256, 3e-3
 

@@ -11,9 +11,10 @@ from typing import Any, TypeAlias
 
 import torch
 
-from ls3_torchrl.trainers.learner import Learner, new_seed
+from ls3_torchrl.trainers.learner import Learner
 from ls3_torchrl.trainers.processes import Processes, Report, Sender
 from ls3_torchrl.trainers.progress import Bar, progress_bar
+from ls3_torchrl.trainers.steps import new_seed
 from ls3_torchrl.trainers.together import can_train_together, train_together
 
 #: A learner's name, its gradient steps, and what they are shown as.

@@ -38,9 +38,6 @@ class LaggedTargets:
     ) -> None:
         self.batches = batches
         self._loss, self._interval, self._compute = loss, interval, compute
-        self._forget()
-
-    def _forget(self) -> None:
         self._of: tuple[Any, ...] = ()  # what the targets were computed of, and with
         self._drawn: TensorDictBase | None = None
         self._first = 0

@@ -2,84 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.nn import Parameter
 from torch.nn.modules.dropout import _DropoutNd
-from torch.nn.utils import get_total_norm
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.record.loggers import Logger
 
 from ls3_torchrl._memory import keep_freed_memory
 from ls3_torchrl.data import BatchStream
 from ls3_torchrl.exceptions import DivergenceError
-from ls3_torchrl.layers import fastest_precision
 from ls3_torchrl.objectives.base import LatentLoss
 from ls3_torchrl.objectives.lagged import LaggedTargetLoss
-from ls3_torchrl.options.training import Autocast
 from ls3_torchrl.trainers.lagged_targets import LaggedTargets
 from ls3_torchrl.trainers.progress import Bar, progress_bar
-
-#: Gradient steps between logged metrics.
-LOG_INTERVAL = 100
-
-
-@contextmanager
-def threads(count: int | None) -> Iterator[None]:
-    """Compute on ``count`` cores; on as many as before when ``None``."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count or before)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def wants_bf16(autocast: Autocast, device: torch.device) -> bool:
-    """What ``autocast`` of true, false or ``"auto"`` means on a device."""
-    return fastest_precision(device.type) == "bf16" if autocast == "auto" else bool(autocast)
-
-
-def cooled_down(fraction: float, cooldown: float) -> float:
-    """What a learning rate has fallen to after a fraction of a phase's steps: 1, then linearly to 0 at the end."""
-    return 1.0 if fraction < 1.0 - cooldown else (1.0 - fraction) / cooldown
-
-
-def log_scalars(logger: Logger | None, phase: str, step: int, scalars: dict[str, float]) -> None:
-    """Write metrics under ``phase/name``; nowhere without a logger."""
-    if logger is not None:
-        for name, value in scalars.items():
-            logger.log_scalar(f"{phase}/{name}", value, step=step)
-
-
-def new_seed(generator: torch.Generator | None = None) -> int:
-    """A seed from a random stream, PyTorch's own when ``None``."""
-    return int(torch.randint(2**63 - 1, (), generator=generator))
-
-
-def set_gradients(parameters: Iterable[Parameter], value: Tensor) -> bool:
-    """Compute the gradients of ``value``; whether it and the square of its gradient are finite.
-
-    Otherwise no step is to be taken: Adam's average of squares would stay infinite for ever, and what it belongs to
-    would never move again.
-    """
-    parameters = list(parameters)
-    for parameter in parameters:
-        parameter.grad = None
-    value.backward()
-    return is_finite(parameters, value)
-
-
-def is_finite(parameters: Iterable[Tensor], value: Tensor) -> bool:
-    """Whether a loss and the square of its gradient are finite."""
-    # NaN and infinity outlast a norm, which is cheaper than a look at every entry.
-    norm = get_total_norm([parameter.grad for parameter in parameters if parameter.grad is not None])
-    return bool(torch.isfinite(value.detach() + norm))
+from ls3_torchrl.trainers.steps import LOG_INTERVAL, cooled_down, log_scalars, new_seed, set_gradients, threads
 
 
 class AuxiliaryLoss(NamedTuple):

@@ -23,7 +23,8 @@ from ls3_torchrl.objectives.base import LatentLoss
 from ls3_torchrl.options.training import LS3Options
 from ls3_torchrl.trainers.checks import require_actions_of, warn_of_missing_outcomes
 from ls3_torchrl.trainers.group import LearnerGroup, Stage
-from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner, wants_bf16
+from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner
+from ls3_torchrl.trainers.steps import wants_bf16
 
 #: The learners in the order in which they are trained.
 LEARNERS = ("dynamics", "value", "value_td", "safe_set", "constraint", "goal")

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from torch import Tensor
 
 from ls3_torchrl.objectives.head import StackedHeads
-from ls3_torchrl.trainers.learner import Learner, is_finite, set_gradients, threads
+from ls3_torchrl.trainers.learner import Learner
 from ls3_torchrl.trainers.progress import Bar
+from ls3_torchrl.trainers.steps import is_finite, set_gradients, threads
 
 
 def can_train_together(learners: Sequence[Learner]) -> bool:

@@ -19,8 +19,8 @@ from ls3_torchrl.halves import Halves
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
 from ls3_torchrl.options.training import VAEOptions
 from ls3_torchrl.trainers.checks import require_actions_of
-from ls3_torchrl.trainers.learner import LOG_INTERVAL, is_finite, log_scalars, wants_bf16
 from ls3_torchrl.trainers.progress import progress_bar
+from ls3_torchrl.trainers.steps import LOG_INTERVAL, is_finite, log_scalars, wants_bf16
 from ls3_torchrl.trainers.vae_gradient import CROP, TARGET, VAEGradient, in_channel_order, in_memory_order, reordered
 
 _log = logging.getLogger(__name__)

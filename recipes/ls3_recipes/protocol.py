@@ -26,8 +26,8 @@ from ls3_recipes.together import require_room, require_tools
 from ls3_torchrl.data import Tag, load_episodes, save_episodes
 from ls3_torchrl.files import is_full, save_atomically
 from ls3_torchrl.trainers import DivergenceError, Stateful
-from ls3_torchrl.trainers.learner import log_scalars
 from ls3_torchrl.trainers.progress import progress_bar
+from ls3_torchrl.trainers.steps import log_scalars
 
 #: Of the online episodes, what figures and pictures need beyond what is learnt from.
 _KEPT = ("state", ("next", "state"), ("next", "done"))

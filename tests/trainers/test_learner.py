@@ -16,7 +16,7 @@ from ls3_torchrl.baselines import AWACLoss, action_value, gaussian_actor
 from ls3_torchrl.modules import ValueEnsemble
 from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, TD1ValueLoss
 from ls3_torchrl.trainers import AuxiliaryLoss, DivergenceError, Learner, LearnerGroup
-from ls3_torchrl.trainers.learner import cooled_down, threads
+from ls3_torchrl.trainers.steps import cooled_down, threads
 
 
 def values(value, latent):

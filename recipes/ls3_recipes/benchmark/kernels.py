@@ -19,7 +19,7 @@ from ls3_recipes.options import as_dict
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, VAELoss
 from ls3_torchrl.planners.fused import _GPU_BLOCK, FusedImagination
-from ls3_torchrl.trainers.learner import threads
+from ls3_torchrl.trainers.steps import threads
 
 #: What a GPU needs to be told of one operator, in microseconds: the usual range.
 LAUNCH_US = (5.0, 10.0)

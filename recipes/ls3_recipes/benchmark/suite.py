@@ -27,7 +27,7 @@ from ls3_recipes.plots.style import draw
 from ls3_recipes.run_files import require_new
 from ls3_recipes.run_folder import RunFolder
 from ls3_torchrl import LS3Agent
-from ls3_torchrl.trainers.learner import threads
+from ls3_torchrl.trainers.steps import threads
 
 
 def run_benchmark(settings: BenchmarkSettings) -> dict:
