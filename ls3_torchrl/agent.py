@@ -123,6 +123,8 @@ class LS3Agent(nn.Module):
             action_dim = self.action_spec.shape[-1]
         self.planner_settings = dict(planner or {})
         self.task = None if task is None else str(task)
+        #: How far it was trained when its file was written, where the file says so.
+        self.stage: str | None = None
         if isinstance(architecture.get("action_scale"), str):
             architecture["action_scale"] = self._half_range(architecture["action_scale"])
         self.architecture = shape = AgentArchitecture(action_dim, **architecture)
@@ -205,8 +207,14 @@ class LS3Agent(nn.Module):
         self.action_spec, self.planner_settings = spec, self.planner_settings | settings
         return policy
 
-    def save(self, path: str | Path) -> Path:
+    def save(self, path: str | Path, *, stage: str | None = None) -> Path:
         """Write weights and all that the agent was made for to one file; a half-written file never takes its place.
+
+        Args:
+            path: the file.
+            stage: how far it is trained: ``"vae"`` for one of which the VAE is trained and nothing else, except for
+                dynamics that are trained along with it. :class:`~ls3_torchrl.trainers.VAETrainer` takes these as well
+                from such a file, and goes on as if it had trained both.
 
         Raises:
             ValueError: for weights that are not finite, or a planner setting that a file cannot keep.
@@ -221,6 +229,7 @@ class LS3Agent(nn.Module):
             "action_spec": None if spec is None else {"low": spec.space.low.cpu(), "high": spec.space.high.cpu()},
             "planner": {name: _storable(name, value) for name, value in self.planner_settings.items()},
             "task": self.task,
+            "stage": stage,
             "versions": _versions(),
             "state_dict": self.state_dict(),
         }
@@ -259,6 +268,7 @@ class LS3Agent(nn.Module):
         dtypes = {w.dtype for w in weights.values() if isinstance(w, Tensor) and w.is_floating_point()}
         agent.to(device=device, dtype=dtypes.pop() if len(dtypes) == 1 else None)
         _require_dtypes(path, agent, weights)
+        agent.stage = content.get("stage")
         try:
             agent.load_state_dict(weights)
         except (RuntimeError, TypeError) as error:

@@ -28,8 +28,8 @@ class ControlOptions:
 
     horizon: int = 5
     num_particles: int = 20
-    safe_set_threshold: float = 0.8
-    constraint_threshold: float = 0.2
+    safe_set_threshold: float | None = 0.8
+    constraint_threshold: float | None = 0.2
     relaxation: float = 0.8
     max_relaxations: int = 5
     constraint_reduction: ConstraintReduction = "max"
@@ -44,8 +44,10 @@ class ControlOptions:
     def __post_init__(self) -> None:
         for name in ("horizon", "num_particles"):
             require_at_least(getattr(self, name), 1, name)
-        for name in ("safe_set_threshold", "constraint_threshold", "relaxation"):
-            require_probability(getattr(self, name), name)
+        require_probability(self.relaxation, "relaxation")
+        for name in ("safe_set_threshold", "constraint_threshold"):
+            if getattr(self, name) is not None:
+                require_probability(getattr(self, name), name)
         require_at_least(self.max_relaxations, 0, "max_relaxations")
         require_choice(self.goal_reduction, ("count", "expected"), "goal_reduction")
         for name in ("pessimism", "noise_scale"):

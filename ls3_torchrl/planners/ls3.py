@@ -73,8 +73,9 @@ class LS3Planner(MPCPlannerBase):
             ``None``.
         horizon: H, imagined steps.
         num_particles: P, imagined outcomes of each plan.
-        safe_set_threshold: initial δ_S, a probability strictly between 0 and 1.
-        constraint_threshold: δ_C, likewise.
+        safe_set_threshold: initial δ_S, a probability strictly between 0 and 1; ``None`` for plans that may end
+            anywhere, and are never relaxed.
+        constraint_threshold: δ_C, likewise; ``None`` for plans whatever they violate.
         relaxation: factor on δ_S when nothing is feasible, strictly between 0 and 1.
         max_relaxations: how often δ_S may be relaxed in one plan.
         constraint_reduction: over particles, ``"max"`` as the authors' code or ``"mean"``.
@@ -100,7 +101,7 @@ class LS3Planner(MPCPlannerBase):
 
     Returns:
         From the call: the tensordict with ``action``, and under ``plan`` ``feasible``, ``fallback``, ``relaxed``,
-        ``safe_set_threshold`` (the δ_S acted on), ``score``, ``iterations``, all ``[*B, 1]``; under
+        ``safe_set_threshold`` (the δ_S acted on, 0 for none), ``score``, ``iterations``, all ``[*B, 1]``; under
         ``("next", "plan")`` the warm start ``mean`` and ``std`` ``[*B, H, A]``. ``out_keys`` name all of these.
         ``in_keys`` name what is read: the observation, and if the optimiser uses it, the warm start and ``is_init``.
         A tensordict may lack those two, but a ``TensorDictSequential`` that is ``partial_tolerant`` leaves the planner
@@ -140,8 +141,8 @@ class LS3Planner(MPCPlannerBase):
         *,
         horizon: int = 5,
         num_particles: int = 20,
-        safe_set_threshold: float = 0.8,
-        constraint_threshold: float = 0.2,
+        safe_set_threshold: float | None = 0.8,
+        constraint_threshold: float | None = 0.2,
         relaxation: float = 0.8,
         max_relaxations: int = 5,
         constraint_reduction: ConstraintReduction = "max",
@@ -178,7 +179,7 @@ class LS3Planner(MPCPlannerBase):
             precision=precision,
         )
         self.horizon, self.num_particles = horizon, num_particles
-        self.safe_set_threshold, self.constraint_threshold = float(safe_set_threshold), float(constraint_threshold)
+        self.safe_set_threshold, self.constraint_threshold = safe_set_threshold, constraint_threshold
         self.relaxation, self.max_relaxations = float(relaxation), max_relaxations
         self.goal_reduction: GoalReduction = goal_reduction
         self.pessimism, self.noise_scale, self.common_noise = pessimism, noise_scale, common_noise
@@ -278,12 +279,18 @@ class LS3Planner(MPCPlannerBase):
             )
 
     def score_plans(self, statistics: PlanStatistics, threshold: Tensor) -> PlanScores:
-        """Objective, feasibility and fallback ranking of candidates under δ_S ``[b, 1]``."""
+        """Objective, feasibility and fallback ranking of candidates under δ_S ``[b, 1]``; 0 allows every end."""
+        limit, inside = self._constraint_limit, self.safe_set_threshold is not None
         return PlanScores(
             objective(statistics, pessimism=self.pessimism, goal_reduction=self.goal_reduction),
-            feasible(statistics, safe_set_threshold=threshold, constraint_threshold=self.constraint_threshold),
-            least_harm(statistics, constraint_threshold=self.constraint_threshold),
+            feasible(statistics, safe_set_threshold=threshold, constraint_threshold=limit),
+            least_harm(statistics, constraint_threshold=limit, safe_set=inside),
         )
+
+    @property
+    def _constraint_limit(self) -> float:
+        """δ_C as a number: no probability exceeds 1."""
+        return 1.0 if self.constraint_threshold is None else float(self.constraint_threshold)
 
     @torch.compiler.disable  # a search with data-dependent ends, over threads of its own: nothing to trace
     @torch.no_grad()
@@ -310,7 +317,7 @@ class LS3Planner(MPCPlannerBase):
             else:
                 sampled = noise.of_iteration(iteration, rows)
             threshold = self._threshold(restarts).unsqueeze(-1)
-            limits = Limits(threshold, self.constraint_threshold)
+            limits = Limits(threshold, self._constraint_limit)
             statistics = imagine(latent[rows], actions, sampled, limits)
             scores = self.score_plans(statistics, threshold)
             require_sound(statistics, scores)
@@ -327,14 +334,14 @@ class LS3Planner(MPCPlannerBase):
                 space.high.float(),
                 batch=latent.shape[0],
                 horizon=self.horizon,
-                max_restarts=self.max_relaxations,
+                max_restarts=0 if self.safe_set_threshold is None else self.max_relaxations,
                 mean=mean,
                 std=std,
                 noise=None if noise is None else given,
             )
 
     def _threshold(self, restarts: Tensor) -> Tensor:
-        return self.safe_set_threshold * self.relaxation ** restarts.to(torch.float32)
+        return (self.safe_set_threshold or 0.0) * self.relaxation ** restarts.to(torch.float32)
 
     def planning(self, td: TensorDictBase, noise: PlanNoise | None = None) -> Tensor:
         """The actions ``[*B, A]`` alone, as TorchRL's planners return them."""

@@ -58,7 +58,7 @@ def feasible(statistics: PlanStatistics, *, safe_set_threshold: Tensor | float, 
     return satisfied & (statistics.safe_set_prob >= safe_set_threshold)
 
 
-def least_harm(statistics: PlanStatistics, *, constraint_threshold: float) -> Tensor:
+def least_harm(statistics: PlanStatistics, *, constraint_threshold: float, safe_set: bool = True) -> Tensor:
     """Ranking for when nothing is feasible, ``[*B, N]``: fewest violating steps, then the safest end.
 
     NaN where a probability is: nobody knows what such a plan would do.
@@ -66,11 +66,14 @@ def least_harm(statistics: PlanStatistics, *, constraint_threshold: float) -> Te
     Args:
         statistics: of the candidates.
         constraint_threshold: δ_C.
+        safe_set: whether the end is asked for; of plans with as many violating steps, those come first otherwise that
+            are the least likely to violate in any one step.
     """
     violations = (statistics.constraint_prob > constraint_threshold).sum(-1)
     unknown = statistics.constraint_prob.isnan().any(-1)
+    safest = statistics.safe_set_prob if safe_set else 1.0 - statistics.constraint_prob.amax(-1)
     # A probability of at most one half of a step keeps the order lexicographic.
-    return (0.5 * statistics.safe_set_prob - violations).masked_fill(unknown, torch.nan)
+    return (0.5 * safest - violations).masked_fill(unknown, torch.nan)
 
 
 def require_sound(statistics: PlanStatistics, scores: PlanScores) -> None:

@@ -165,13 +165,15 @@ class VAETrainer:
                 raise DivergenceError(PHASE, self.steps, {}, None, "Lower VAEOptions.lr.") from error
 
     def _take_checkpoint(self, path: str) -> None:
-        """Take encoder and decoder of a trained agent."""
+        """Take encoder and decoder of a trained agent, and dynamics that were trained along with these alone."""
         shape = self.agent.architecture
         trained = LS3Agent.load(
             path, in_channels=shape.in_channels, latent_dim=shape.latent_dim, background=shape.background
         )
         for half, other in ((self.agent.encoder, trained.encoder), (self.agent.decoder, trained.decoder)):
             half.load_state_dict(other.state_dict())
+        if trained.stage == "vae" and trained.architecture == shape:
+            self.agent.dynamics.load_state_dict(trained.dynamics.state_dict())
 
     def _minimise(self) -> None:
         options = self.options

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, make_dataclass, replace
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 from ls3_envs.registry import DOMAINS
 from ls3_recipes.options import as_dict
@@ -39,10 +39,15 @@ class CollectSettings:
             )
 
 
-#: Each planner setting in place of the run's, which ``None`` keeps.
+#: In place of a setting, the one that the run has.
+AS_TRAINED = "as trained"
+#: Each planner setting in place of the run's.
 PlannerChanges = make_dataclass(
     "PlannerChanges",
-    [(name, hint | None, field(default=None)) for name, hint in get_type_hints(PlannerOptions).items()],
+    [
+        (name, hint | Literal["as trained"], field(default=AS_TRAINED))
+        for name, hint in get_type_hints(PlannerOptions).items()
+    ],
     frozen=True,
 )
 
@@ -80,19 +85,21 @@ class EvaluateSettings:
     @property
     def planner_changes(self) -> dict[str, Any]:
         """The planner's settings that differ from the run's."""
-        return {name: value for name, value in as_dict(self.planner).items() if value is not None}
+        return {name: value for name, value in as_dict(self.planner).items() if value != AS_TRAINED}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportSettings:
-    """What is compared, and where it goes.
+    """What is reported, and where it goes.
 
     Args:
-        runs: folders of finished runs, of any of the algorithms; one alone need not be a list.
+        runs: folders of runs, or with runs below them; one alone need not be a list.
+        title: of the page.
         output: a folder that does not exist yet.
     """
 
     runs: tuple[str, ...] | str = ()
+    title: str = "Runs"
     output: str
 
     def __post_init__(self) -> None:
@@ -100,9 +107,37 @@ class ReportSettings:
         if isinstance(self.runs, str):
             object.__setattr__(self, "runs", (self.runs,))
         if not self.runs:
-            raise ValueError("No runs: pass runs=[DIR,DIR,...], folders of finished runs.")
+            raise ValueError("No runs: pass their folders, or one that holds them: ls3 report FOLDER [FOLDER ...].")
         for path in (*self.runs, self.output):
             require_path(path, "output" if path is self.output else "runs")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepSettings:
+    """Which runs, where they are carried out, and what is made of them.
+
+    Args:
+        title: of the report.
+        arms: arguments of ``ls3 train`` for each; several values of a setting are as many runs.
+        settings: arguments for all arms.
+        rollouts: episodes in which the agent of every update is evaluated; 0 for none.
+        output: a folder; a sweep that was begun there goes on.
+        launcher: of ``hydra/launcher``.
+    """
+
+    title: str = "Runs"
+    arms: tuple[tuple[str, ...], ...] = ((),)
+    settings: tuple[str, ...] = ()
+    rollouts: int = 0
+    output: str
+    launcher: Any = None
+
+    def __post_init__(self) -> None:
+        """Refuse a sweep of nothing."""
+        require_at_least(self.rollouts, 0, "rollouts")
+        require_path(self.output, "output")
+        if not self.arms:
+            raise ValueError("arms must hold at least one list of arguments, got none: arms=[[]] is a run as it is.")
 
 
 #: Figures of cost as work grows.

@@ -44,6 +44,8 @@ def composed(command: str, overrides: Sequence[str], folder: str | None = None) 
             config = compose(command, [*known, *searched], return_hydra_config=True)
         HydraConfig.instance().set_config(config)  # for those that a user's file refers to
         with open_dict(config):
+            if "hydra/launcher" in GROUPS.get(command, ()):
+                config["launcher"] = config["hydra"]["launcher"]
             del config["hydra"]
             for override in parse(own):
                 config[override.key_or_group] = override.value()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ls3_recipes.console import print_summary
 from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.figures import episode_figures, summarise
 from ls3_recipes.options import as_dict, defaults, errors_of
-from ls3_recipes.plots.run import save_video
+from ls3_recipes.plots.films import save_film
 from ls3_recipes.plots.style import draw
 from ls3_recipes.rollout import make_env, run_episodes
 from ls3_recipes.run_files import require_new
@@ -88,7 +89,8 @@ def evaluate(settings: EvaluateSettings) -> dict:
         "minutes": folder.minutes,
     }
     folder.write_json("summary.json", summary)
-    failed = draw({"evaluation.gif": lambda: save_video(folder.path / "evaluation.gif", episodes)})
+    films = ("evaluation.gif", "evaluation.mp4")
+    failed = draw({name: partial(save_film, folder.path / name, episodes) for name in films})
     summary |= {"minutes": folder.minutes} | ({"failed_pictures": failed} if failed else {})
     folder.write_json("summary.json", summary)
     folder.close()

@@ -11,7 +11,8 @@ from torchrl.data import TensorSpec
 
 from ls3_recipes.console import console
 from ls3_recipes.rollout import collect_demonstrations
-from ls3_recipes.run_settings import TaskSettings
+from ls3_recipes.run_settings import RunSettings, TaskSettings
+from ls3_recipes.seeding import seeds
 from ls3_torchrl.data import Tag, TaggedReplayBuffer, check_datasets, load_episodes, save_episodes
 
 Offline = dict[Tag, TensorDictBase]
@@ -57,6 +58,13 @@ def collected_data(folder: Path, task: TaskSettings, seed: int, run_seed: int) -
             collected = collect_demonstrations(task, seed)
         save_episodes(collected, folder, task=task.name, seed=run_seed)
     return load_episodes(folder)  # from the disk: there may be more than memory
+
+
+def collect_for_run(settings: RunSettings) -> None:
+    """The demonstrations that a run would collect, into its ``output``, for runs that share them."""
+    assert settings.output is not None
+    task, seed = settings.task, settings.seed
+    collected_data(Path(settings.output), task, seeds(seed)["demonstrations"], seed)
 
 
 def tell_of_eviction(buffer: TaggedReplayBuffer, online: int) -> None:

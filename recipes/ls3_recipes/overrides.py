@@ -15,7 +15,7 @@ from ls3_recipes.typed import did_you_mean
 
 CONF = Path(__file__).parent / "conf"
 #: Folders of ``conf/`` whose files can be chosen, by command.
-GROUPS = {"train": ("algorithm", "task", "preset", "tuned"), "collect": ("task",)}
+GROUPS = {"train": ("algorithm", "task", "preset", "tuned"), "collect": ("task",), "sweep": ("sweep", "hydra/launcher")}
 
 
 def parse(overrides: Iterable[str]) -> list[Override]:
@@ -65,7 +65,7 @@ def check(
     seen: dict[str, str] = {}
     for override in parse(overrides):
         name, line = override.get_key_element().lstrip("+~"), str(override.input_line)
-        if name.startswith(("hydra.", "hydra/")):
+        if name.startswith(("hydra.", "hydra/")) and name not in groups:
             continue
         if name in seen and seen[name] != line:
             raise ValueError(f"{name} is given twice: {seen[name]} and {line}. Leave one out.")

@@ -21,7 +21,7 @@ from ls3_recipes.versions import FORMAT, VERSION, description
 #: Where runs go that are given no ``output``.
 RUNS = Path("runs")
 #: Settings that say where a run and what it reads lie, and not what it does.
-_PLACES = ("output", "data", "scratch_dir", "vae.checkpoint", "checkpoint_minutes", "pictures")
+_PLACES = ("output", "data", "scratch_dir", "vae.checkpoint", "checkpoint_minutes", "pictures", "tracker")
 #: What stands for a choice that was made when the run began.
 _OPEN = {
     "device": "auto",

@@ -47,7 +47,12 @@ class RunLogger(Logger):
         self._open("a")
         if self._csv.tell() == 0:
             self._rows.writerow(COLUMNS)
+        self._followers: list[Logger] = []
         super().__init__(exp_name="tensorboard", log_dir=str(folder))
+
+    def follow(self, logger: Logger) -> None:
+        """Have another logger get every metric as well, from now on."""
+        self._followers.append(logger)
 
     def _open(self, mode: str) -> None:
         self._csv = self._path.open(mode, newline="", encoding="utf-8")
@@ -71,6 +76,8 @@ class RunLogger(Logger):
             raise OSError(error.errno, f"{error.strerror}; a metric could not be written", str(self._path)) from error
         self._count += 1
         self.experiment.add_scalar(name, value, step)
+        for follower in self._followers:
+            follower.log_scalar(name, value, step)
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **options: Any) -> None:
         """A video ``[N, T, C, H, W]``, to TensorBoard."""
@@ -122,6 +129,8 @@ class RunLogger(Logger):
         with suppress(OSError):  # on a full disk: each row was flushed when it was written, or said to have failed
             self._csv.close()
             super().close(timeout)
+            for follower in self._followers:
+                follower.close(timeout)
 
     def __repr__(self) -> str:
         return f"RunLogger({self.log_dir!r})"

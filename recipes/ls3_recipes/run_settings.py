@@ -16,7 +16,7 @@ from ls3_torchrl.options.training import VAEOptions
 #: The parts of a run have seeds of their own, up to ten thousand times as large.
 _LARGEST_SEED = 10**14
 #: Settings that can be changed when a run goes on: where things lie, and not what it does.
-CHANGEABLE = ("data", "scratch_dir", "checkpoint_minutes", "pictures")
+CHANGEABLE = ("data", "scratch_dir", "checkpoint_minutes", "pictures", "tracker")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,6 +149,7 @@ class RunSettings:
         device: ``"auto"``, ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         threads: intra-op threads, at least 1; ``None`` for PyTorch's choice, which is kept for the whole run.
         pictures: leave pictures in the run's folder.
+        tracker: ``"wandb"`` for metrics on Weights & Biases as well; offline with ``WANDB_MODE=offline``.
         task: what is learnt.
         agent: sizes of the networks. To a baseline that reads latents, all of them matter: it makes the whole agent, so
             that with the same seed it draws the same random numbers, and the VAE is LS³'s bit for bit.
@@ -169,6 +170,7 @@ class RunSettings:
     device: str = "auto"
     threads: int | None = None
     pictures: bool = True
+    tracker: Literal["wandb"] | None = None
     task: TaskSettings
     agent: AgentSettings  # type: ignore[valid-type]
     vae: VAEOptions

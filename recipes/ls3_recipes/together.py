@@ -14,6 +14,7 @@ from ls3_recipes.options import as_dict
 from ls3_recipes.rollout import make_env
 from ls3_recipes.run_files import require_folder
 from ls3_recipes.run_settings import RunSettings
+from ls3_recipes.tracker import require_tracker
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag
 
@@ -30,6 +31,7 @@ def require_tools(settings: RunSettings, channels: int, horizon: int) -> None:
         ValueError: naming the setting, and what to do.
     """
     settings.require_horizon(horizon)
+    require_tracker(settings.tracker)
     if settings.scratch_dir is not None:
         require_folder(settings.scratch_dir, "scratch_dir")
     if "vae" in settings.unread:

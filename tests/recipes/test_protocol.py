@@ -16,7 +16,8 @@ from ls3_recipes import offline_data, protocol
 from ls3_recipes.algorithms import ls3
 from ls3_recipes.configuration import settings_of_run, train_settings
 from ls3_recipes.options import as_dict
-from ls3_recipes.protocol import run_experiment, seeds
+from ls3_recipes.seeding import seeds
+from ls3_recipes.protocol import run_experiment
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, load_episodes, save_episodes
 

@@ -11,7 +11,8 @@ from tiny_runs import LS3, TINY
 from ls3_recipes.algorithms import ls3
 from ls3_recipes.commands.train import main
 from ls3_recipes.configuration import train_settings
-from ls3_recipes.protocol import Experiment, run_experiment
+from ls3_recipes.experiment import Experiment
+from ls3_recipes.protocol import run_experiment
 from ls3_torchrl.trainers import DivergenceError, Learner
 
 # TorchRL warns about classes of its own while its collectors are imported.

@@ -59,7 +59,7 @@ def kill_myself():
 
 def _name_phases(where, hold):
     """Let the process tell what it is doing, and pause where ``hold`` begins: it may be over in a millisecond."""
-    from ls3_recipes.protocol import Experiment
+    from ls3_recipes.experiment import Experiment
     from ls3_recipes.run_folder import RunFolder
     from ls3_torchrl.trainers import Checkpoints, Learner, VAETrainer
 

@@ -101,6 +101,11 @@ class Algorithm(ABC):
         """Figures about what it has learnt, for the summary."""
         return {}
 
+    @property
+    def vae_agent(self) -> LS3Agent | None:
+        """The networks of which the VAE is one; ``None`` where nothing reads latents."""
+        return None
+
     @abstractmethod
     def save(self, path: Path) -> Path:
         """Write all networks to one file."""

@@ -148,6 +148,11 @@ class Baseline(Algorithm):
         if self.vae_trainer is not None:
             self.vae_trainer.encode()
 
+    @property
+    def vae_agent(self) -> LS3Agent | None:
+        """The networks of which encoder and decoder are read."""
+        return self.vae
+
     def save(self, path: Path) -> Path:
         """Write the networks' weights."""
         content = {

@@ -91,6 +91,11 @@ class LS3(Algorithm):
         """How well latents and imagination know the simulator's state, where the episodes keep it."""
         return probe(self.agent, list(offline.values()), evaluation, self.policy.horizon)
 
+    @property
+    def vae_agent(self) -> LS3Agent:
+        """The agent."""
+        return self.agent
+
     def save(self, path: Path) -> Path:
         """As a file of :class:`~ls3_torchrl.LS3Agent`."""
         return self.agent.save(path)

@@ -13,7 +13,8 @@ COMMANDS = {
     "train": "train an agent: demonstrations, offline training, online improvement, evaluation, pictures",
     "collect": "collect a task's offline episodes, to train on later",
     "evaluate": "let a trained agent act, without learning",
-    "report": "compare finished runs in one picture and one table",
+    "sweep": "carry out many runs: a figure of the paper, or settings of your own",
+    "report": "show what several runs say together, on one page",
     "benchmark": "time planning, updates, environments and buffer on this machine",
     "gallery": "draw every domain: a demonstration and a violation",
 }

@@ -101,10 +101,19 @@ def agent_fields(env: VisualConstraintEnv, agent: LS3Agent, planner: LS3Planner)
     return {
         "Value V": Field(values.mean(-1), "viridis"),
         "Spread of V over members": Field(values.std(-1, correction=_correction(values)), "magma"),
-        "Safe set $f_S$": Field(safe, "BuGn", (0.0, 1.0), planner.safe_set_threshold),
-        "Constraint $f_C$": Field(unsafe, "OrRd", (0.0, 1.0), planner.constraint_threshold),
+        _title("Safe set $f_S$", planner.safe_set_threshold): Field(
+            safe, "BuGn", (0.0, 1.0), planner.safe_set_threshold
+        ),
+        _title("Constraint $f_C$", planner.constraint_threshold): Field(
+            unsafe, "OrRd", (0.0, 1.0), planner.constraint_threshold
+        ),
         "Goal $f_G$": Field(probability_of(agent.goal, latent), "Blues", (0.0, 1.0), 0.5),
     }
+
+
+def _title(name: str, threshold: float | None) -> str:
+    """A head's title, which says so where plans are made without it."""
+    return name if threshold is not None else f"{name}, not asked"
 
 
 @torch.no_grad()
@@ -147,7 +156,7 @@ def _plot_candidates(
     latent = _encode(agent, env.render_states(state[None]))["latent"]
     uniform = torch.rand(1, candidates, horizon, space.low.shape[-1], device=latent.device)
     actions = space.low + (space.high - space.low) * uniform
-    threshold = torch.full((1, 1), planner.safe_set_threshold, device=latent.device)
+    threshold = torch.full((1, 1), planner.safe_set_threshold or 0.0, device=latent.device)
     feasible = planner.score_plans(planner.imagine_plans(latent, actions), threshold).feasible
     chosen = planner.plan(latent).actions
     for action, allowed in zip(actions[0].cpu(), feasible[0].cpu(), strict=True):
@@ -200,18 +209,19 @@ def plot_timelines(
         axes[1, 0].set_ylabel("value V")
         axes[2, 0].set_ylabel("probability")
         figure.tight_layout()
-        _legend(figure)
+        _legend(figure, planner)
 
 
-def _legend(figure: Figure) -> None:
+def _legend(figure: Figure, planner: LS3Planner) -> None:
     """What lines and bands mean, in one row below all panels, where it hides nothing."""
+    safe_set, constraint = planner.safe_set_threshold, planner.constraint_threshold
     band = Patch(color=INK, alpha=0.15, lw=0, label="spread over members")
     lines = (
         ("mean value", INK, 1.4, "-"),
-        ("safe set $f_S$", SAFE, 1.4, "-"),
-        (r"threshold $\delta_S$", SAFE, 0.9, ":"),
-        ("constraint $f_C$", UNSAFE, 1.4, "-"),
-        (r"threshold $\delta_C$", UNSAFE, 0.9, ":"),
+        (_title("safe set $f_S$", safe_set), SAFE, 1.4, "-"),
+        *([] if safe_set is None else [(r"threshold $\delta_S$", SAFE, 0.9, ":")]),
+        (_title("constraint $f_C$", constraint), UNSAFE, 1.4, "-"),
+        *([] if constraint is None else [(r"threshold $\delta_C$", UNSAFE, 0.9, ":")]),
         ("goal $f_G$", GOAL, 1.4, "-"),
         ("goal first reached", GOAL, 1.0, "|"),
         ("first violation", UNSAFE, 1.0, "|"),
@@ -254,7 +264,8 @@ def _plot_heads(axis: Axes, agent: LS3Agent, planner: LS3Planner, latent: Tensor
     for head, name, colour in heads:
         axis.plot(time, probability_of(head, latent).flatten().cpu().numpy(), color=colour, lw=1.4, label=name)
     for level, colour in ((planner.safe_set_threshold, SAFE), (planner.constraint_threshold, UNSAFE)):
-        axis.axhline(level, color=colour, lw=0.7, ls=":")
+        if level is not None:
+            axis.axhline(level, color=colour, lw=0.7, ls=":")
     axis.set(ylim=(-0.03, 1.03), xlabel="step")
 
 

@@ -76,7 +76,7 @@ def maps(
     plane = the_plane(env)
     with picture(folder / "heatmaps.png", 1, len(fields), (3.2 * len(fields), 3.0)) as (figure, axes):
         for axis, (title, field) in zip(axes[0], fields.items(), strict=True):
-            shown = _plot_field(axis, plane, field)
+            shown = draw_field(axis, plane, field)
             for tag, colour in ((Tag.SUCCESS, SAFE), (Tag.CONSTRAINT, UNSAFE)):
                 for track in states_of(offline.get(tag), 8):
                     axis.plot(*line(plane.positions(track)), color=colour, lw=0.5, alpha=0.6)
@@ -85,7 +85,8 @@ def maps(
             figure.colorbar(shown, ax=axis, shrink=0.7, pad=0.02)
 
 
-def _plot_field(axis: Axes, plane: Plane, field: Field) -> object:
+def draw_field(axis: Axes, plane: Plane, field: Field) -> object:
+    """Draw a field over the plane; returns what a colour bar is made of."""
     values = field.values.reshape(plane.states.shape[:2]).cpu().numpy()
     low, high = field.limits or (values.min(), values.max())
     shown = axis.imshow(values, extent=plane.extent, cmap=field.colours, vmin=low, vmax=high, interpolation="nearest")

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from ls3_envs import VisualConstraintEnv
+from ls3_recipes.plots.films import save_film
 from ls3_recipes.plots.plane import plane_of, plot_outlines, states_of, the_plane
 from ls3_recipes.plots.style import INK, PALE, SAFE, UNSAFE, Pictures, grid, image, line, picture, plt
 from ls3_recipes.run_files import read_metrics
@@ -41,7 +41,8 @@ def pictures_of_run(
     pictures: Pictures = {
         "learning_curves.png": lambda: plot_learning_curves(folder, read_series(folder)),
         "losses.png": lambda: plot_losses(folder, read_series(folder)),
-        "evaluation.gif": lambda: save_video(folder / "evaluation.gif", evaluation),
+        "evaluation.gif": lambda: save_film(folder / "evaluation.gif", evaluation),
+        "evaluation.mp4": lambda: save_film(folder / "evaluation.mp4", evaluation),
     }
     env = plane_of(task)
     if env is not None:
@@ -114,23 +115,3 @@ def plot_paths(
         violated = evaluation["next", "constraint"].any(1).flatten()
         for track, bad in zip(evaluation["state"], violated, strict=True):
             now.plot(*line(plane.positions(track)), color=UNSAFE if bad else SAFE, lw=0.8, alpha=0.7)
-
-
-def save_video(path: Path, episodes: TensorDictBase, *, count: int = 6, zoom: int = 3, gap: int = 6) -> None:
-    """A GIF of some episodes side by side, each framed green in the goal and red once it violated."""
-    frames = []
-    shown = episodes[:count]
-    observations = shown["next", "pixels"]
-    side = observations.shape[-1] * zoom
-    for t in range(observations.shape[1]):
-        sheet = Image.new("RGB", (count * (side + gap) + gap, side + 2 * gap), "white")
-        pen = ImageDraw.Draw(sheet)
-        for i in range(len(shown)):
-            x = gap + i * (side + gap)
-            bad, good = (bool(shown["next", key][i, t]) for key in ("constraint", "success"))
-            colour = UNSAFE if bad else SAFE if good else PALE
-            pen.rectangle((x - 3, gap - 3, x + side + 2, gap + side + 2), fill=colour)
-            frame = Image.fromarray(image(observations[i, t]))
-            sheet.paste(frame.resize((side, side), Image.Resampling.NEAREST), (x, gap))
-        frames.append(sheet.quantize(32))
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=60, loop=0, optimize=True)

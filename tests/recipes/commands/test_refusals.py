@@ -8,7 +8,7 @@ import torch
 from ls3_recipes import collection, offline_data
 from ls3_recipes.benchmark import suite
 from ls3_recipes.commands import main
-from ls3_recipes.protocol import Experiment
+from ls3_recipes.experiment import Experiment
 
 TRAIN = ("train", "preset=smoke")
 #: Arguments, and what the line says beside the command's name.

@@ -1,0 +1,71 @@
+"""What became of a sweep's runs: a table on the disk, written anew with every change."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from ls3_recipes.run_files import read_json
+from ls3_recipes.sweep.jobs import Job
+from ls3_torchrl.files import save_text_atomically
+
+COLUMNS = ("name", "kind", "state", "minutes", "success", "violations", "return", "folder", "error", "arguments")
+#: States of a job, in the words of the index.
+WAITING, RUNNING, FINISHED, FAILED, CUT_OFF, NOT_BEGUN = (
+    *("waiting", "running", "finished", "failed", "cut off", "not begun"),
+)
+
+
+class Index:
+    """State and outcome of every job.
+
+    Args:
+        path: of the table, in CSV.
+        jobs: of the sweep.
+    """
+
+    def __init__(self, path: Path, jobs: Iterable[Job]) -> None:
+        self.path, self._jobs = path, {job.name: job for job in jobs}
+        self.states = dict.fromkeys(self._jobs, WAITING)
+        self.errors: dict[str, str] = {}
+
+    def set(self, states: Mapping[str, str], errors: Mapping[str, str] | None = None) -> None:
+        """Change the states of some jobs, and write the table."""
+        self.states.update(states)
+        self.errors.update(errors or {})
+        text = io.StringIO()
+        rows = csv.DictWriter(text, COLUMNS)
+        rows.writeheader()
+        rows.writerows(self._row(job) for job in self._jobs.values())
+        save_text_atomically(text.getvalue(), self.path)
+
+    def _row(self, job: Job) -> dict[str, str]:
+        state = self.states[job.name]
+        return {
+            "name": job.name,
+            "kind": job.kind,
+            "state": state,
+            "folder": str(job.folder.relative_to(self.path.parent)),
+            "error": self.errors.get(job.name, ""),
+            "arguments": " ".join(job.arguments),
+            **(outcome_of(job) if state == FINISHED else {}),
+        }
+
+
+def outcome_of(job: Job) -> dict[str, str]:
+    """Minutes of a job, and how a run's evaluation went, where its summary tells."""
+    out: dict[str, str] = {}
+    if job.kind in ("vae", "train"):
+        with suppress(OSError, ValueError, KeyError):
+            summary = read_json(job.folder / "summary.json")
+            out["minutes"] = f"{summary['minutes']:.1f}"
+            evaluation = summary["evaluation"]
+            out |= {
+                "success": f"{evaluation['success_rate']:.2f}",
+                "violations": f"{evaluation['violation_rate']:.2f}",
+                "return": f"{evaluation['return_mean']:.1f}",
+            }
+    return out

@@ -1,0 +1,90 @@
+"""Many runs of a paper's figure, or of one's own: from their settings to a report."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from omegaconf import OmegaConf
+from rich.table import Table
+
+from ls3_recipes.command_settings import SweepSettings
+from ls3_recipes.console import console
+from ls3_recipes.extra import Job as Command
+from ls3_recipes.interrupts import Interrupts
+from ls3_recipes.options import as_dict
+from ls3_recipes.run_files import require_folder
+from ls3_recipes.run_folder import Lock
+from ls3_recipes.sweep.index import FAILED, FINISHED, NOT_BEGUN, Index
+from ls3_recipes.sweep.jobs import jobs_of
+from ls3_recipes.sweep.launchers import make_launcher
+from ls3_recipes.sweep.plan import planned_runs
+from ls3_recipes.sweep.schedule import Schedule
+from ls3_torchrl.files import save_text_atomically
+
+write_report = Command("ls3 sweep", "ls3_recipes.report.writing:write_report")
+
+
+def sweep(settings: SweepSettings, overrides: Sequence[str] = (), files: str | None = None) -> Index:
+    """Carry out what is left of a sweep: nothing of what is finished, the rest of what was cut off.
+
+    Args:
+        settings: of the sweep.
+        overrides: arguments of ``ls3 train`` for all runs.
+        files: a user's folder of settings.
+
+    Returns:
+        What became of each job; also as ``jobs.csv`` in the folder.
+
+    Raises:
+        ValueError: for a setting that no run can have, before any begins.
+        FileExistsError: while another process is at this sweep.
+        RuntimeError: at the end, when jobs have failed; the others are finished.
+        Interrupted: for Ctrl-C or SIGTERM, when every run has saved its state.
+    """
+    output = Path(settings.output)
+    require_folder(output, "output")
+    runs = planned_runs(settings.arms, settings.settings, overrides, folder=files)
+    jobs = jobs_of(runs, output, settings.rollouts)
+    launcher = make_launcher(settings.launcher, output)
+    output.mkdir(parents=True, exist_ok=True)
+    lock = Lock(output / "lock")
+    try:
+        named = as_dict(settings) | {"runs": {run.name: " ".join(run.overrides) for run in runs}}
+        save_text_atomically(OmegaConf.to_yaml(OmegaConf.create(named)), output / "sweep.yaml")
+        index = Index(output / "jobs.csv", jobs.values())
+        schedule = Schedule(
+            jobs, index, launcher, output / "logs", "" if files is None else str(Path(files).absolute())
+        )
+        with Interrupts() as interrupts:
+            try:
+                schedule.carry_out(interrupts)
+            except KeyboardInterrupt:
+                console.print("To go on: the same command.")
+                raise
+        launcher.close()
+        _tell(index, output)
+        finished = [str(jobs[run.name].folder) for run in runs if index.states[run.name] == FINISHED]
+        if finished:
+            write_report(finished, output / "report", settings.title, index.errors)
+    finally:
+        lock.release()
+    failed = [name for name, state in index.states.items() if state in (FAILED, NOT_BEGUN)]
+    if failed:
+        raise RuntimeError(
+            f"{len(failed)} of {len(jobs)} jobs failed or could not begin; what they said is in {output / 'logs'}. "
+            "Remove the cause and start the sweep again: what is finished is left as it is."
+        )
+    return index
+
+
+def _tell(index: Index, output: Path) -> None:
+    """How many jobs ended how, and why those failed that did."""
+    counts = Counter(index.states.values())
+    console.print(f"{', '.join(f'{count} {state}' for state, count in counts.items())}: {output / 'jobs.csv'}")
+    if index.errors:
+        table = Table("job", "error", title="What failed")
+        for name, error in index.errors.items():
+            table.add_row(name, error)
+        console.print(table)

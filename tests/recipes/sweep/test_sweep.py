@@ -1,0 +1,138 @@
+"""Whole sweeps of tiny runs: shared VAEs, stopping, going on, and the same figures wherever they are carried out."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from ls3_recipes.configuration import train_settings
+from ls3_recipes.protocol import run_experiment, train_vae
+from ls3_recipes.run_files import read_json
+from ls3_torchrl import LS3Agent
+
+TINY = ["preset=smoke", "device=cpu", "threads=1", "pictures=false"]
+
+
+def ls3(*arguments, **options):
+    return subprocess.Popen(
+        [sys.executable, "-m", "ls3_recipes", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        **options,
+    )
+
+
+def finished(process, status=0):
+    out, _ = process.communicate(timeout=600)
+    assert process.returncode == status, out
+    return out
+
+
+def table(folder):
+    """Every figure of every run and update, without what a clock or a place is in."""
+    rows = []
+    for name in ("runs.csv", "curves.csv"):
+        with (folder / "report" / name).open() as file:
+            rows += [{key: row[key] for key in row if key not in ("minutes", "folder")} for row in csv.DictReader(file)]
+    return rows
+
+
+def jobs(folder):
+    with (folder / "jobs.csv").open() as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
+
+
+@pytest.mark.parametrize("algorithm", ["ls3", "awac"])
+def test_a_run_with_a_shared_vae_ends_in_the_bits_of_one_that_makes_its_own(tmp_path, algorithm):
+    how = [*TINY, f"algorithm={algorithm}", "vae.prediction_weight=1.0"]
+    run_experiment(train_settings(*how, f"output={tmp_path / 'alone'}"))
+    shared = train_vae(train_settings(*how, f"output={tmp_path / 'vae'}"))
+    given = f"data={tmp_path / 'vae' / 'demonstrations'}", f"vae.checkpoint={shared}"
+    run_experiment(train_settings(*how, *given, f"output={tmp_path / 'with'}"))
+    one, other = (
+        torch.load(tmp_path / name / "agent.pt", weights_only=True)["state_dict"] for name in ("alone", "with")
+    )
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    first, second = (read_json(tmp_path / name / "summary.json") for name in ("alone", "with"))
+    assert first["evaluation"] == second["evaluation"]
+
+
+def test_a_shared_vae_says_what_it_is(tmp_path):
+    path = train_vae(train_settings(*TINY, f"output={tmp_path / 'vae'}"))
+    assert LS3Agent.load(path).stage == "vae"
+    agent = LS3Agent.load(path)
+    assert LS3Agent.load(agent.save(tmp_path / "agent.pt")).stage is None
+    with pytest.raises(ValueError, match="has no VAE"):
+        train_vae(train_settings(*TINY, "algorithm=bc", "encoder=conv", f"output={tmp_path / 'none'}"))
+
+
+def test_a_sweep_goes_on_where_it_was_killed_and_ends_with_the_same_figures(tmp_path):
+    arms = ["planner.constraint_threshold=0.3,null", "rollouts=2", *TINY]
+    finished(ls3("sweep", *arms, f"output={tmp_path / 'whole'}", "hydra.launcher.workers=1", cwd=tmp_path))
+    killed = ls3("sweep", *arms, f"output={tmp_path / 'killed'}", "hydra.launcher.workers=2", cwd=tmp_path)
+    while not any((tmp_path / "killed").glob("runs/*/metrics.csv")):
+        assert killed.poll() is None
+        time.sleep(0.05)
+    os.kill(killed.pid, signal.SIGKILL)
+    killed.communicate()
+    unfinished = [row for row in jobs(tmp_path / "killed").values() if row["state"] != "finished"]
+    assert unfinished
+    out = finished(ls3("sweep", *arms, f"output={tmp_path / 'killed'}", "hydra.launcher.workers=2", cwd=tmp_path))
+    assert "finished" in out
+    assert table(tmp_path / "killed") == table(tmp_path / "whole")
+    rows = jobs(tmp_path / "killed")
+    assert {row["state"] for row in rows.values()} == {"finished"}
+    assert sorted(row["kind"] for row in rows.values()) == ["data", "rollouts", "rollouts", "train", "train", "vae"]
+    text = (tmp_path / "killed" / "report" / "report.html").read_text()
+    assert "no constraints" in text
+    assert not [path for path in (tmp_path / "killed").rglob("*") if path.is_dir() and not any(path.iterdir())]
+    before = (tmp_path / "killed" / "runs").stat().st_mtime_ns
+    finished(ls3("sweep", *arms, f"output={tmp_path / 'killed'}", cwd=tmp_path))  # nothing is left
+    assert (tmp_path / "killed" / "runs").stat().st_mtime_ns == before
+    assert not (tmp_path / "runs").exists()
+    assert not (tmp_path / "multirun").exists()
+
+
+def test_a_run_that_fails_is_listed_and_the_others_are_finished(tmp_path):
+    (tmp_path / "out" / "runs" / "ls3-navigation-seed0").mkdir(parents=True)
+    (tmp_path / "out" / "runs" / "ls3-navigation-seed0" / "note.txt").write_text("a folder of someone else's")
+    process = ls3("sweep", *TINY, "seed=0,1", f"output={tmp_path / 'out'}", cwd=tmp_path)
+    out = finished(process, status=1)
+    rows = jobs(tmp_path / "out")
+    assert rows["ls3-navigation-seed0"]["state"] == "failed"
+    assert "exists already" in rows["ls3-navigation-seed0"]["error"]
+    assert rows["ls3-navigation-seed1"]["state"] == "finished"
+    assert "1 of 6 jobs failed" in out
+    assert "What failed" in (tmp_path / "out" / "report" / "report.html").read_text()
+
+
+def test_ctrl_c_saves_every_run(tmp_path):
+    process = ls3("sweep", *TINY, "vae.steps=100000", f"output={tmp_path / 'out'}", cwd=tmp_path)
+    while not any((tmp_path / "out").glob("shared/vae-*/metrics.csv")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    time.sleep(1.0)
+    process.send_signal(signal.SIGINT)
+    out = finished(process, status=130)
+    assert "To go on: the same command" in out
+    assert any((tmp_path / "out").glob("shared/vae-*/checkpoints/run-*"))
+    assert "cut off" in {row["state"] for row in jobs(tmp_path / "out").values()}
+
+
+def test_refusals_come_before_the_folder(tmp_path):
+    out = finished(ls3("sweep", *TINY, "planner.horizon=3,99", f"output={tmp_path / 'out'}", cwd=tmp_path), status=1)
+    assert "planner.horizon must not exceed" in out
+    assert len(out.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+    out = finished(ls3("sweep", "hydra/launcher=cloud", cwd=tmp_path), status=1)
+    assert "hydra/launcher must be one of local, ray, slurm; got 'cloud'" in out
+    out = finished(ls3("sweep", "hydra.launcher.worker=2", cwd=tmp_path), status=1)
+    assert "worker" in out
+    assert not (tmp_path / "runs").exists()
