@@ -16,6 +16,7 @@ from ls3_recipes.device import choose_device, hardware
 from ls3_recipes.figures import Figures, best_update, episode_figures, means_of, summarise
 from ls3_recipes.interrupts import Interrupts
 from ls3_recipes.offline_data import Offline, collected_data, given_data, tell_of_eviction
+from ls3_recipes.options import as_dict
 from ls3_recipes.plots.agent import plot_reconstructions
 from ls3_recipes.plots.run import pictures_of_run
 from ls3_recipes.plots.style import draw
@@ -25,9 +26,8 @@ from ls3_recipes.rollout import make_env, run_episodes, tick, whole_episodes
 from ls3_recipes.run_settings import RunSettings
 from ls3_recipes.run_state import RunState
 from ls3_recipes.seeding import seeds
-from ls3_recipes.options import as_dict
-from ls3_recipes.tracker import make_tracker
 from ls3_recipes.together import require_room, require_tools
+from ls3_recipes.tracker import make_tracker
 from ls3_torchrl.data import Tag, load_episodes, save_episodes
 from ls3_torchrl.files import save_atomically
 from ls3_torchrl.trainers import Stateful

@@ -117,6 +117,32 @@ def test_the_threshold_is_relaxed_as_often_as_needed_and_no_further(prob, k):
     assert not out["plan", "fallback"].any()
 
 
+@pytest.mark.parametrize("engine", ["fused", "rollout"])
+def test_without_a_constraint_threshold_plans_go_wherever_the_value_is(engine):
+    wall = classifier(ConstraintEstimator, slope=40.0, offset=0.5)  # everything beyond 0.5 violates
+    torch.manual_seed(0)
+    kept = stub_planner(constraint=wall, constraint_threshold=0.2, engine=engine)(latents(1))
+    torch.manual_seed(0)
+    free = stub_planner(constraint=wall, constraint_threshold=None, engine=engine)(latents(1))
+    assert kept["action"][0, 0] < 0.5 < free["action"][0, 0]
+    assert free["plan", "feasible"].all()
+
+
+@pytest.mark.parametrize("engine", ["fused", "rollout"])
+def test_without_a_safe_set_threshold_plans_end_anywhere_and_are_not_relaxed(engine):
+    nowhere = classifier(SafeSet, prob=0.001)
+    planner = stub_planner(safe_set=nowhere, safe_set_threshold=None, engine=engine)
+    out = planner(latents(2))
+    assert out["plan", "feasible"].all()
+    assert not out["plan", "relaxed"].any()
+    assert (out["plan", "safe_set_threshold"] == 0.0).all()
+    assert (out["plan", "iterations"] == planner.optimizer.optim_steps).all()
+    blocked = stub_planner(constraint=classifier(ConstraintEstimator, prob=0.9), safe_set_threshold=None, engine=engine)
+    out = blocked(latents(1))
+    assert out["plan", "fallback"].all()
+    assert not out["plan", "relaxed"].any()  # a lower threshold of nothing would change nothing
+
+
 def test_each_row_relaxes_for_itself():
     # f_S depends on z_2, which no action moves: 0.9, 0.7 and 0.45 for the three rows.
     safe_set = classifier(SafeSet, slope=1.0, offset=0.0, axis=2)

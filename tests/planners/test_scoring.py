@@ -77,6 +77,13 @@ def test_least_harm_counts_violations_first_and_the_safe_end_second():
     assert ranking.argsort(descending=True).tolist() == [4, 3, 2, 1, 0]
 
 
+def test_without_a_safe_set_the_least_likely_violation_comes_second():
+    plans = statistics(constraint=[[0.9, 0.1], [0.6, 0.1], [0.1, 0.15]], safe=[0.9, 0.1, 0.0])
+    ranks = least_harm(plans, constraint_threshold=0.2, safe_set=False)
+    assert ranks.argsort(descending=True).tolist() == [2, 1, 0]
+    assert least_harm(plans, constraint_threshold=0.2).argsort(descending=True).tolist() == [2, 0, 1]
+
+
 def test_least_harm_is_lexicographic_for_any_probabilities():
     torch.manual_seed(0)
     constraint, safe = torch.rand(300, 5), torch.rand(300)

@@ -12,12 +12,12 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
-from ls3_recipes import offline_data, protocol
+from ls3_recipes import experiment, offline_data
 from ls3_recipes.algorithms import ls3
 from ls3_recipes.configuration import settings_of_run, train_settings
 from ls3_recipes.options import as_dict
-from ls3_recipes.seeding import seeds
 from ls3_recipes.protocol import run_experiment
+from ls3_recipes.seeding import seeds
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, load_episodes, save_episodes
 
@@ -197,7 +197,7 @@ def test_the_seed_decides_a_run(no_probe, tmp_path):
 
 @pytest.mark.parametrize("select", ["last", "best"])
 def test_the_agent_that_is_kept_is_the_one_that_was_selected(no_probe, monkeypatch, tmp_path, select):
-    monkeypatch.setattr(protocol, "best_update", lambda online: 1)
+    monkeypatch.setattr(experiment, "best_update", lambda online: 1)
     run_experiment(settings(f"online.select={select}", "pictures=false", f"output={tmp_path / 'run'}"))
     kept = LS3Agent.load(tmp_path / "run" / "agent.pt").state_dict()
     agents = [LS3Agent.load(path).state_dict() for path in sorted((tmp_path / "run" / "checkpoints").glob("*.pt"))]

@@ -16,9 +16,9 @@ from ls3_recipes.algorithms import ls3
 from ls3_recipes.commands.train import main
 from ls3_recipes.configuration import settings_of_run, train_settings
 from ls3_recipes.decided import decided
+from ls3_recipes.experiment import Experiment
 from ls3_recipes.options import as_dict
 from ls3_recipes.progress import HeldRandomState, Progress, Worlds
-from ls3_recipes.experiment import Experiment
 from ls3_recipes.protocol import run_experiment
 from ls3_recipes.resume import begun_with, open_folder
 from ls3_recipes.rollout import collect_demonstrations, make_env

@@ -136,6 +136,7 @@ WORDS = {
     "planner.goal_reduction": ("count", "expected"),
     "planner.precision": ("auto", "fp32", "bf16"),
     "planner.safe_set_reduction": ("mean", "min"),
+    "tracker": ("wandb",),
     "task.name": ("navigation", "reacher", "pushing", "cable_routing"),
     "vae.autocast": (True, False, "auto"),
     "vae.reduction": ("mean", "sum"),
@@ -146,6 +147,7 @@ PAIRS = {"vae.crop_scale", "vae.warmup"}
 TEXTS = {"algorithm", "preset", "device", "output"}
 PATHS = {"data", "scratch_dir", "vae.checkpoint", "output"}
 OR_NULL = {"data", "output", "scratch_dir", "vae.checkpoint", "vae.crop_scale", "vae.warmup", "loss.failure_value"}
+OR_NULL |= {"planner.constraint_threshold", "planner.safe_set_threshold", "tracker"}
 
 
 def is_whole(value, low):

@@ -13,7 +13,7 @@ from torch import Tensor
 from ls3_envs import VisualConstraintEnv
 from ls3_recipes.plots.films import save_film
 from ls3_recipes.plots.plane import plane_of, plot_outlines, states_of, the_plane
-from ls3_recipes.plots.style import INK, PALE, SAFE, UNSAFE, Pictures, grid, image, line, picture, plt
+from ls3_recipes.plots.style import INK, SAFE, UNSAFE, Pictures, grid, line, picture, plt
 from ls3_recipes.run_files import read_metrics
 from ls3_recipes.run_settings import TaskSettings
 from ls3_torchrl.data import Tag

@@ -98,8 +98,8 @@ class Ray(Launcher):
     """Tasks of a Ray cluster, all of whose nodes see the same folders.
 
     Args:
-        address: of a cluster; ``None`` for one that Ray finds, or else one on this machine that is started and ends with
-            the sweep.
+        address: of a cluster; ``None`` for one that Ray finds, or else one on this machine that is started, and ends
+            with the sweep.
         threads: CPUs of each run.
         num_cpus: start one with so many, whether there is another or not.
         num_gpus: of each run.
@@ -131,8 +131,8 @@ class Ray(Launcher):
                 raise
             ray.init(address="local", num_cpus=self.num_cpus, include_dashboard=False, **quiet)
         self.slots = max(1, int(ray.cluster_resources().get("CPU", 1)) // self.threads)
-        needs = {"num_cpus": self.threads, "num_gpus": self.num_gpus, "max_retries": 0}
-        self._carry_out = ray.remote(**needs)(carry_out)
+        needs: dict[str, Any] = {"num_cpus": self.threads, "num_gpus": self.num_gpus, "max_retries": 0}
+        self._carry_out: Any = ray.remote(**needs)(carry_out)
 
     def submit(self, task: Task) -> Future[int]:
         """Queue a task."""

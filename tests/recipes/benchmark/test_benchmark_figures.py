@@ -16,8 +16,8 @@ from ls3_recipes.benchmark.workbench import make_workbench, preset_settings
 from ls3_recipes.command_settings import FIGURES, GROWING, BenchmarkSettings
 from ls3_recipes.commands import benchmark  # noqa: F401  (Hydra is told of its settings)
 from ls3_recipes.configuration import compose_settings, train_settings
-from ls3_recipes.interrupts import Interrupts
 from ls3_recipes.experiment import Experiment
+from ls3_recipes.interrupts import Interrupts
 from ls3_torchrl.data import buffer as buffer_module
 
 CPU = torch.device("cpu")

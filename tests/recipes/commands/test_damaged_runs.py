@@ -94,7 +94,7 @@ def cut(path):
 @pytest.mark.parametrize(
     ("name", "damage", "said"),
     [
-        ("summary.json", lambda path: path.unlink(), "run is no folder of a finished run: summary.json is missing."),
+        ("summary.json", lambda path: path.unlink(), "None of the 1 runs is finished"),
         ("summary.json", cut, "is damaged: it is no JSON"),
         ("summary.json", lambda path: path.write_bytes(b"\xff\xfe"), "is damaged: it is no text in UTF-8"),
         ("summary.json", lambda path: path.write_text("[1]"), "is damaged: it holds no names with values"),
@@ -135,10 +135,10 @@ def test_report_says_which_file_is_damaged(run, name, damage, said):
 
 def test_a_report_of_a_run_without_a_row_of_metrics_shows_what_there_is(run):
     (run / "metrics.csv").write_text("seconds,phase,step,name,value\n")
-    main(["report", "runs=run", "output=report"])
-    table = (run.parent / "report" / "comparison.md").read_text(encoding="utf-8")
-    assert table.splitlines()[2].endswith("| – |")
-    assert (run.parent / "report" / "comparison.png").stat().st_size > 1000
+    main(["report", "run", "output=report"])
+    assert (run.parent / "report" / "navigation-learning.png").stat().st_size > 1000
+    assert "no online episodes" not in (run.parent / "report" / "curves.csv").read_text(encoding="utf-8")
+    assert (run.parent / "report" / "report.html").is_file()
 
 
 @pytest.mark.slow
@@ -179,4 +179,4 @@ def test_reports_are_written_and_printed_where_text_is_ascii(run):
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "LS?" in done.stdout
-    assert "LS³" in (run.parent / "report" / "comparison.md").read_text(encoding="utf-8")
+    assert "LS³" in (run.parent / "report" / "report.html").read_text(encoding="utf-8")

@@ -7,9 +7,10 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
+from ls3_recipes.command_settings import ReportSettings
 from ls3_recipes.commands.collect import CollectSettings, collect
 from ls3_recipes.commands.evaluate import EvaluateSettings, evaluate
-from ls3_recipes.commands.report import ReportSettings, report
+from ls3_recipes.commands.report import report
 from ls3_recipes.configuration import compose_settings
 from ls3_torchrl.data import Tag, load_episodes
 
@@ -84,9 +85,7 @@ def test_an_agent_that_is_missing_is_named_with_those_that_there_are(run_folder,
 def test_a_report_says_of_an_unfinished_run_how_to_finish_it(run_folder, tmp_path):
     shutil.copytree(run_folder, tmp_path / "run")
     (tmp_path / "run" / "summary.json").unlink()
-    with pytest.raises(
-        FileNotFoundError, match=r"summary.json is missing. Finish the run with ls3 train resume=.*/run"
-    ):
+    with pytest.raises(ValueError, match=r"None of the 1 runs is finished; ls3 train resume=.*/run goes on with one"):
         report(ReportSettings(runs=(str(tmp_path / "run"),), output=str(tmp_path / "report")))
 
 

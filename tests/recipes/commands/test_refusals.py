@@ -39,7 +39,10 @@ MISTAKES = {
         ((*TRAIN, "online=3"), "online is a section, got 3: set online.KEY=VALUE."),
         ((*TRAIN, "online=null"), "online is a section, got null: set online.KEY=VALUE."),
         (("evaluate", "run=x", "episodes=few"), "episodes must be a whole number, got 'few'."),
-        (("evaluate", "run=x", "planner.horizon=long"), "planner.horizon must be a whole number, or null, got 'long'."),
+        (
+            ("evaluate", "run=x", "planner.horizon=long"),
+            "planner.horizon must be a whole number, or 'as trained', got 'long'.",
+        ),
         (("report", "runs=[1,2]"), "runs must be a list of texts, or text, got [1, 2]."),
         (("benchmark", "batches=8"), "batches must be a list of whole numbers, got 8."),
         (("benchmark", "smoke=perhaps"), "smoke must be true or false, got 'perhaps'."),
@@ -141,8 +144,8 @@ MISTAKES = {
         (("evaluate",), "run must be given: it has no default."),
         (("evaluate", "run=nowhere"), "nowhere holds no run: config.yaml is missing."),
         (("evaluate", "run=a_file"), "a_file holds no run: config.yaml is missing."),
-        (("report",), "No runs: pass runs=[DIR,DIR,...]"),
-        (("report", "runs=[nowhere]"), "nowhere is no folder of a finished run: summary.json is missing."),
+        (("report",), "No runs: pass their folders"),
+        (("report", "runs=[nowhere]"), "nowhere holds no run: there is no config.yaml in it, nor anywhere below."),
         (("collect", "output=a_file/data"), "output=a_file/data cannot be made: "),
         (
             ("benchmark", "agent=nowhere.pt"),

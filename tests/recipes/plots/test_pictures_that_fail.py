@@ -78,13 +78,15 @@ def test_results_are_there_before_pictures_which_may_all_fail(tmp_path, monkeypa
 
     monkeypatch.setattr(ls3, "probe", lambda *_: {})
     monkeypatch.setattr(plots_of_run, "picture", fail)
-    monkeypatch.setattr(plots_of_run, "save_video", fail)
+    monkeypatch.setattr(plots_of_run, "save_film", fail)
     summary = run_experiment(train_settings(*QUICK, "algorithm=bc", "encoder=conv", f"output={tmp_path / 'run'}"))
-    assert there == [True] * 4
-    assert set(summary["failed_pictures"]) == {"learning_curves.png", "losses.png", "evaluation.gif", "paths.png"}
+    assert there == [True] * 5
+    assert set(summary["failed_pictures"]) == {
+        *("learning_curves.png", "losses.png", "evaluation.gif", "evaluation.mp4", "paths.png")
+    }
     assert set(summary["failed_pictures"].values()) == {"RuntimeError: no ink"}
     assert json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8")) == summary
-    assert capsys.readouterr().out.count("was not drawn: RuntimeError: no ink") == 4
+    assert capsys.readouterr().out.count("was not drawn: RuntimeError: no ink") == 5
 
 
 class Foreign(nn.Module):
