@@ -19,9 +19,13 @@ NEEDED = (
     "ls3_recipes/conf/preset/cpu.yaml",
     "ls3_recipes/conf/task/navigation.yaml",
     "ls3_recipes/conf/tuned/pushing-cpu.yaml",
+    "ls3_recipes/conf/sweep/figure1.yaml",
+    "ls3_recipes/conf/hydra/launcher/ray.yaml",
+    "ls3_recipes/report/page.html.j2",
     "ls3_recipes/py.typed",
 )
 EXTRAS = ("hydra", "omegaconf", "gymnasium", "mujoco", "mujoco_warp", "cv2", "matplotlib", "PIL", "rich", "tensorboard")
+EXTRAS += ("av", "scipy")
 
 
 def check_archives(folder: Path) -> None:

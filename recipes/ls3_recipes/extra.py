@@ -10,6 +10,7 @@ from typing import Any
 
 #: Packages of the extra without which no command runs.
 EXTRA = ("hydra", "omegaconf", "matplotlib", "PIL", "rich", "tensorboard", "gymnasium", "mujoco", "mujoco_warp", "cv2")
+EXTRA += ("av", "scipy")
 
 
 @contextmanager

@@ -58,9 +58,10 @@ def report(settings: ReportSettings) -> None:
     for part in write_report(settings.runs, folder, settings.title):
         rows = figures_of(part.groups)
         table = Table(title=part.task)
-        for name in rows[0]:
+        shown = [name for name in rows[0] if not name.startswith("online")]
+        for name in shown:
             table.add_column(name.replace(" ", "\n", 1), justify="left" if name == "algorithm" else "right")
         for row in rows:
-            table.add_row(*row.values())
+            table.add_row(*(row[name] for name in shown))
         console.print(table)
     console.print(f"The page is [bold]{escape(str(folder / 'report.html'))}[/bold]", soft_wrap=True)

@@ -56,7 +56,7 @@ def plot_maps(run: Run, path: Path, columns: int = 5) -> None:
                 plot_outlines(axis, plane)
                 for track in _tracks(run, update + 1):
                     axis.plot(*line(plane.positions(track)), color=INK, lw=0.6, alpha=0.7)
-                if column is axes.T[0]:
+                if number == chosen[0]:
                     axis.set_ylabel(title)
             column[0].set_title("offline" if update == 0 else f"update {update}")
         figure.tight_layout()

@@ -117,7 +117,7 @@ def _draw(part: Part, output: Path) -> None:
 
 def _slug(text: str) -> str:
     """A text as the name of a file."""
-    return re.sub(r"[^\w.+-]+", "_", text)
+    return re.sub(r"[^\w.+-]+", "_", text, flags=re.ASCII)
 
 
 def _page(

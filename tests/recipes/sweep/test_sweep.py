@@ -110,7 +110,7 @@ def test_a_run_that_fails_is_listed_and_the_others_are_finished(tmp_path):
     assert "exists already" in rows["ls3-navigation-seed0"]["error"]
     assert rows["ls3-navigation-seed1"]["state"] == "finished"
     assert "1 of 6 jobs failed" in out
-    assert "What failed" in (tmp_path / "out" / "report" / "report.html").read_text()
+    assert "Failed or not finished" in (tmp_path / "out" / "report" / "report.html").read_text()
 
 
 def test_ctrl_c_saves_every_run(tmp_path):
