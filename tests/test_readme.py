@@ -9,12 +9,15 @@ import torch
 
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.benchmark.suite import BenchmarkSettings
+from ls3_recipes.command_settings import SweepSettings
 from ls3_recipes.commands.collect import CollectSettings
 from ls3_recipes.commands.evaluate import EvaluateSettings
 from ls3_recipes.commands.report import ReportSettings
+from ls3_recipes.commands.sweep import divided
 from ls3_recipes.configuration import compose_settings, register, settings_class_of, train_settings
 from ls3_recipes.options import as_dict
 from ls3_recipes.renamed import RENAMED
+from ls3_recipes.sweep.plan import planned_runs
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -94,8 +97,13 @@ def test_commands_compose(line):
         return  # of a run that the reader will have
     if command == "train":
         compose_settings("train", settings_class_of(overrides), overrides)
+    elif command == "sweep":
+        own, of_runs = divided(overrides)
+        sweep = compose_settings(command, SweepSettings, own)
+        assert planned_runs(sweep.arms, sweep.settings, of_runs)
     elif command in SETTINGS:
-        compose_settings(command, SETTINGS[command], overrides)
+        overrides = [word for word in overrides if "=" in word]  # folders of runs that the reader will have
+        compose_settings(command, SETTINGS[command], overrides + (["runs=[a]"] if command == "report" else []))
     else:
         assert command in ("gallery", "--help")
 
@@ -111,7 +119,7 @@ def test_settings_that_the_documents_name_exist_and_by_their_present_names(docum
     parts = [as_dict(train_settings(f"algorithm={algorithm}")) for algorithm in ("ls3", "sacfd", "awac")]
     sections = {key for part in parts for key, value in part.items() if isinstance(value, dict)}
     known = {f"{section}.{name}" for part in parts for section in sections & set(part) for name in part[section]}
-    known |= {f"agent.{ending}" for ending in ("pt", "py")} | {"evaluation.gif"}
+    known |= {f"agent.{ending}" for ending in ("pt", "py")} | {"evaluation.gif", "evaluation.mp4"}
     text = document.read_text()
     named = re.findall(rf"`(?:[^`]* )?((?:{'|'.join(sections)})\.[a-z_]+\b)(?!\()", text)
     missing = set(named) - known

@@ -40,14 +40,24 @@ Examples
 """
 
 
+def divided(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Arguments of the sweep itself, and those of its runs; a first word without a value is the sweep's name.
+
+    Example:
+        >>> divided(["figure1", "seed=0,1", "output=here", "hydra.launcher.workers=1"])
+        (['sweep=figure1', 'output=here', 'hydra.launcher.workers=1'], ['seed=0,1'])
+    """
+    given = [*overrides]
+    if given and "=" not in given[0]:
+        given[0] = f"sweep={given[0]}"
+    own = [override for override in given if name_in(override) in _OWN or name_in(override).startswith("hydra")]
+    return own, [override for override in given if override not in own]
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
-    arguments = [*(sys.argv[1:] if arguments is None else arguments)]
-    if arguments and "=" not in arguments[0] and not arguments[0].startswith("-"):
-        arguments[0] = f"sweep={arguments[0]}"
-    options, overrides = split_arguments(arguments)
-    own = [override for override in overrides if name_in(override) in _OWN or name_in(override).startswith("hydra")]
-    of_runs = [override for override in overrides if override not in own]
+    options, overrides = split_arguments(sys.argv[1:] if arguments is None else arguments)
+    own, of_runs = divided(overrides)
     files = config_dir(options)
 
     def carry_out(settings: SweepSettings) -> None:
