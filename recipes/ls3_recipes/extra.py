@@ -9,8 +9,10 @@ from importlib import import_module
 from typing import Any
 
 #: Packages of the extra without which no command runs.
-EXTRA = ("hydra", "omegaconf", "matplotlib", "PIL", "rich", "tensorboard", "gymnasium", "mujoco", "mujoco_warp", "cv2")
-EXTRA += ("av", "scipy")
+EXTRA = (
+    *("hydra", "omegaconf", "matplotlib", "PIL", "av", "scipy", "rich", "tensorboard"),
+    *("gymnasium", "mujoco", "mujoco_warp", "cv2"),
+)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from ls3_recipes.configuration import register, run_command
 from ls3_recipes.extra import Job
 from ls3_recipes.options import leaves
 from ls3_recipes.overrides import choices_of
+from ls3_recipes.sweep import JobsFailedError
 
 register("sweep", SweepSettings)
 sweep = Job("ls3 sweep", "ls3_recipes.sweep.sweep:sweep")
@@ -61,6 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     files = config_dir(options)
 
     def carry_out(settings: SweepSettings) -> None:
-        sweep(settings, of_runs, files)
+        try:
+            sweep(settings, of_runs, files)
+        except JobsFailedError as error:
+            raise SystemExit(f"ls3 sweep: {error}") from None
 
     run_command("sweep", SweepSettings, carry_out, [*own, *options], help_text=help_text())

@@ -31,11 +31,14 @@ class Index:
         self.path, self._jobs = path, {job.name: job for job in jobs}
         self.states = dict.fromkeys(self._jobs, WAITING)
         self.errors: dict[str, str] = {}
+        self._outcomes: dict[str, dict[str, str]] = {}
 
     def set(self, states: Mapping[str, str], errors: Mapping[str, str] | None = None) -> None:
         """Change the states of some jobs, and write the table."""
         self.states.update(states)
         self.errors.update(errors or {})
+        done = [self._jobs[name] for name, state in states.items() if state == FINISHED]
+        self._outcomes |= {job.name: outcome_of(job) for job in done}
         text = io.StringIO()
         rows = csv.DictWriter(text, COLUMNS)
         rows.writeheader()
@@ -43,15 +46,14 @@ class Index:
         save_text_atomically(text.getvalue(), self.path)
 
     def _row(self, job: Job) -> dict[str, str]:
-        state = self.states[job.name]
         return {
             "name": job.name,
             "kind": job.kind,
-            "state": state,
+            "state": self.states[job.name],
             "folder": str(job.folder.relative_to(self.path.parent)),
             "error": self.errors.get(job.name, ""),
             "arguments": " ".join(job.arguments),
-            **(outcome_of(job) if state == FINISHED else {}),
+            **self._outcomes.get(job.name, {}),
         }
 
 

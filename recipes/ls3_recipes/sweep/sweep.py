@@ -16,6 +16,7 @@ from ls3_recipes.interrupts import Interrupts
 from ls3_recipes.options import as_dict
 from ls3_recipes.run_files import require_folder
 from ls3_recipes.run_folder import Lock
+from ls3_recipes.sweep import JobsFailedError
 from ls3_recipes.sweep.index import FAILED, FINISHED, NOT_BEGUN, Index
 from ls3_recipes.sweep.jobs import jobs_of
 from ls3_recipes.sweep.launchers import make_launcher
@@ -40,7 +41,7 @@ def sweep(settings: SweepSettings, overrides: Sequence[str] = (), files: str | N
     Raises:
         ValueError: for a setting that no run can have, before any begins.
         FileExistsError: while another process is at this sweep.
-        RuntimeError: at the end, when jobs have failed; the others are finished.
+        JobsFailedError: at the end, when jobs have failed; the others are finished.
         Interrupted: for Ctrl-C or SIGTERM, when every run has saved its state.
     """
     output = Path(settings.output)
@@ -72,7 +73,7 @@ def sweep(settings: SweepSettings, overrides: Sequence[str] = (), files: str | N
         lock.release()
     failed = [name for name, state in index.states.items() if state in (FAILED, NOT_BEGUN)]
     if failed:
-        raise RuntimeError(
+        raise JobsFailedError(
             f"{len(failed)} of {len(jobs)} jobs failed or could not begin; what they said is in {output / 'logs'}. "
             "Remove the cause and start the sweep again: what is finished is left as it is."
         )

@@ -109,7 +109,8 @@ def test_a_run_that_fails_is_listed_and_the_others_are_finished(tmp_path):
     assert rows["ls3-navigation-seed0"]["state"] == "failed"
     assert "exists already" in rows["ls3-navigation-seed0"]["error"]
     assert rows["ls3-navigation-seed1"]["state"] == "finished"
-    assert "1 of 6 jobs failed" in out
+    assert "ls3 sweep: 1 of 6 jobs failed" in out
+    assert "Traceback" not in out
     assert "Failed or not finished" in (tmp_path / "out" / "report" / "report.html").read_text()
 
 
