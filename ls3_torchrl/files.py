@@ -17,6 +17,8 @@ from uuid import uuid4
 PARTIAL = ".partial"
 #: Free bytes below which a write that failed is taken for one that found no room.
 _NO_ROOM = 16 * 2**20
+#: Of an archive's part: that it is a folder.
+_FOLDER = 0x10
 
 
 def save_atomically(content: Any, path: str | Path) -> Path:
@@ -131,8 +133,10 @@ def load_verified(path: str | Path, what: str) -> Any:
         # PyTorch writes a checksum for every part of its archive, and does not look at them when it reads.
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
+            if damaged is None:  # of what is marked as a folder PyTorch reads nothing, without a word
+                damaged = next((part.filename for part in archive.infolist() if part.external_attr & _FOLDER), None)
         if damaged is not None:
-            raise ValueError(f"its part {damaged} does not match its checksum")
+            raise ValueError(f"its part {damaged} does not match its checksum, or is marked as a folder")
         return torch.load(path, map_location="cpu", weights_only=True)
     except MemoryError:
         raise

@@ -69,6 +69,16 @@ def check(path, agent):
     return same(agent, loaded)
 
 
+def test_a_part_that_is_marked_as_a_folder_is_found(tmp_path, saved):
+    _, content = saved
+    first = content.index(b"PK\x01\x02")  # the first entry of the archive's directory; its attributes follow
+    damaged = bytearray(content)
+    damaged[first + 38] ^= 0x10
+    (tmp_path / "agent.pt").write_bytes(damaged)
+    with pytest.raises(ValueError, match="marked as a folder"):
+        load(tmp_path / "agent.pt")
+
+
 @settings(max_examples=1500)
 @given(where=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_a_flipped_bit_anywhere_is_found_or_changes_nothing(tmp_path_factory, saved, where, bit):

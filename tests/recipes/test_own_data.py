@@ -147,4 +147,4 @@ def test_everything_is_written_and_read_where_text_is_not_utf8(own_data, tmp_pat
 
     ls3_command("train", "preset=smoke", "online.updates=1", f"data={own_data()}", "output=run", "pictures=false")
     ls3_command("report", "runs=[run]", "output=report")
-    assert "LS³" in next((tmp_path / "report").glob("*.md")).read_text(encoding="utf-8")
+    assert "LS³" in (tmp_path / "report" / "report.html").read_text(encoding="utf-8")

@@ -220,7 +220,7 @@ def test_what_was_asked_for_by_name_is_not_another_run_s_choice():
         (["resume=nowhere"], "nowhere holds no run: config.yaml is missing"),
         (
             ["resume=mine", "seed=3"],
-            "only data, scratch_dir, checkpoint_minutes, pictures may be given anew, got seed=3",
+            "only data, scratch_dir, checkpoint_minutes, pictures, tracker may be given anew, got seed=3",
         ),
         (["resume=mine", "checkpoint_minutes=often"], "checkpoint_minutes must be a finite number, got 'often'"),
         (["resume="], "resume needs the folder of a run"),

@@ -46,17 +46,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     run_command("report", ReportSettings, report, [*overrides, *options], help_text=HELP)
 
 
-def report(settings: ReportSettings) -> None:
+def report(settings: ReportSettings) -> list[dict[str, str]]:
     """Write the page and its files, and print its tables.
+
+    Returns:
+        The tables' rows, those of each task after another.
 
     Raises:
         ValueError: for runs that cannot be compared.
         FileNotFoundError: for a folder without runs.
         FileExistsError: when the output folder exists.
     """
-    folder = require_new(settings.output)
+    folder, every = require_new(settings.output), []
     for part in write_report(settings.runs, folder, settings.title):
         rows = figures_of(part.groups)
+        every += rows
         table = Table(title=part.task)
         shown = [name for name in rows[0] if not name.startswith("online")]
         for name in shown:
@@ -65,3 +69,4 @@ def report(settings: ReportSettings) -> None:
             table.add_row(*(row[name] for name in shown))
         console.print(table)
     console.print(f"The page is [bold]{escape(str(folder / 'report.html'))}[/bold]", soft_wrap=True)
+    return every

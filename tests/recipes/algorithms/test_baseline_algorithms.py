@@ -72,7 +72,7 @@ def test_ls3_and_a_baseline_go_through_evaluate_and_report(run_folder, tmp_path)
     assert not (tmp_path / "other").exists()
     made = report(ReportSettings(runs=(str(run_folder), str(folder)), output=str(tmp_path / "report")))
     assert [row["algorithm"] for row in made] == ["LS³", "AWAC"]
-    assert (tmp_path / "report" / "comparison.png").is_file()
+    assert (tmp_path / "report" / "navigation-learning.png").is_file()
 
 
 @pytest.mark.slow
