@@ -90,7 +90,8 @@ class Baseline(Algorithm):
         self.buffer = buffer
         self.how: dict[str, Any] = {"logger": logger, "after_step": after_step}
         self.vae_trainer = None if self.vae is None else VAETrainer(self.vae, buffer, self.settings.vae, **self.how)
-        self.learners = LearnerGroup(self.make_learners(horizon))
+        with torch.random.fork_rng():  # SAC's loss draws numbers, and the VAE is to be LS³'s
+            self.learners = LearnerGroup(self.make_learners(horizon))
 
     def make_learners(self, horizon: int) -> dict[str, Learner]:
         """By name; here the one that clones, ``"cloning"``."""
