@@ -36,7 +36,7 @@ def trained_settings(settings: EvaluateSettings) -> RunSettings:
     if not changes:
         return trained
     if not isinstance(trained, LS3Settings):
-        named = ", ".join(f"planner.{name}={value}" for name, value in changes.items())
+        named = ", ".join(f"planner.{name}={'null' if value is None else value}" for name, value in changes.items())
         raise ValueError(f"{settings.run} is a run of {trained.algorithm}, which has no planner: leave out {named}.")
     with errors_of("planner", defaults(PlannerOptions)):
         return replace(trained, planner=replace(trained.planner, **changes))

@@ -136,6 +136,13 @@ def require_same_run(path: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
     """The settings with which a run began; ``FileExistsError`` for a folder that holds no unfinished run of these."""
     if not (path / "config.yaml").is_file():
         require_new(path)
+    there = require_same_settings(path, wanted)
+    require_unfinished(path)
+    return there
+
+
+def require_same_settings(path: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a run, finished or not; ``FileExistsError`` where they are others than those that are wanted."""
     there = read_yaml(path / "config.yaml")
     different = list(_differences(there, wanted))
     if different:
@@ -143,7 +150,6 @@ def require_same_run(path: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
             f"{path} holds a run of other settings: {'; '.join(different[:3])}. "
             "Choose another output=DIR, or give the settings of that run to continue it."
         )
-    require_unfinished(path)
     return there
 
 

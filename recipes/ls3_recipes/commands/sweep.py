@@ -42,15 +42,16 @@ Examples
 
 
 def divided(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Arguments of the sweep itself, and those of its runs; a first word without a value is the sweep's name.
+    """Arguments of the sweep itself, and those of its runs; a word without a value is the sweep's name.
 
     Example:
         >>> divided(["figure1", "seed=0,1", "output=here", "hydra.launcher.workers=1"])
         (['sweep=figure1', 'output=here', 'hydra.launcher.workers=1'], ['seed=0,1'])
     """
     given = [*overrides]
-    if given and "=" not in given[0]:
-        given[0] = f"sweep={given[0]}"
+    for i, override in enumerate(given):
+        if "=" not in override and not override.startswith(("+", "~")):
+            given[i] = f"sweep={override}"
     own = [override for override in given if name_in(override) in _OWN or name_in(override).startswith("hydra")]
     return own, [override for override in given if override not in own]
 
@@ -58,6 +59,8 @@ def divided(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
     options, overrides = split_arguments(sys.argv[1:] if arguments is None else arguments)
+    if {"-m", "--multirun"} & set(options):
+        raise SystemExit("ls3 sweep: several values of a setting are several runs as they are. Leave --multirun out.")
     own, of_runs = divided(overrides)
     files = config_dir(options)
 

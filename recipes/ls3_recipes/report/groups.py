@@ -61,10 +61,18 @@ def grouped(runs: Sequence[Run], labels: Labels) -> list[Group]:
 
 def _of_algorithm(name: str, runs: Sequence[Run], label: Label) -> list[Group]:
     names = differing([run.settings for run in runs])
+    alone = [(run.seed, *(repr(run.settings.get(key)) for key in names)) for run in runs]
+    if len({*alone}) < len(alone):  # runs of one seed that differ in nothing else were given different data
+        runs = [run._replace(settings=run.settings | run.given) for run in runs]
+        names = differing([run.settings for run in runs])
     by_settings: dict[tuple[str, ...], list[Run]] = defaultdict(list)
     for run in runs:
         by_settings[tuple(repr(run.settings.get(key)) for key in names)].append(run)
     ordered = sorted(by_settings.values(), key=lambda group: [_rank(group[0].settings.get(key)) for key in names])
+    changed = [{key: group[0].settings.get(key) for key in names} for group in ordered]
+    titles = [_title(label.title, changes, _SHOWN) for changes in changed]
+    if len({*titles}) < len(titles):
+        titles = [_title(label.title, changes, len(changes)) for changes in changed]
     groups = []
     for number, group in enumerate(ordered):
         seeds = [run.seed for run in group]
@@ -73,9 +81,8 @@ def _of_algorithm(name: str, runs: Sequence[Run], label: Label) -> list[Group]:
             raise ValueError(
                 f"Runs of {label.title} with the same settings and seed come twice: {where}. Leave one out."
             )
-        changes = {key: group[0].settings.get(key) for key in names}
         colour = label.colour if len(ordered) == 1 else _shade(number, len(ordered))
-        groups.append(Group(_title(label.title, changes), name, changes, group, colour))
+        groups.append(Group(titles[number], name, changed[number], group, colour))
     return groups
 
 
@@ -97,9 +104,10 @@ def _rank(value: Any) -> tuple[int, float, str]:
     return (2, 0.0, "") if value is None else (1, 0.0, str(value))
 
 
-def _title(algorithm: str, changes: Mapping[str, Any]) -> str:
-    shown = [said(name, value) for name, value in [*changes.items()][:_SHOWN]]
-    more = [f"{len(changes) - _SHOWN} more"] if len(changes) > _SHOWN else []
+def _title(algorithm: str, changes: Mapping[str, Any], count: int) -> str:
+    """Algorithm and the first settings in which it differs, and how many more there are."""
+    shown = [said(name, value) for name, value in [*changes.items()][:count]]
+    more = [f"{len(changes) - count} more"] if len(changes) > count else []
     return f"{algorithm}, {', '.join([*shown, *more])}" if changes else algorithm
 
 

@@ -28,6 +28,8 @@ PLACES = (
     "device",
     "threads",
 )
+#: Of these, what may still tell one run from another: seeds usually have data and VAEs of their own.
+GIVEN = ("data", "vae.checkpoint")
 _REMEDY = "Restore the file, or leave the run out."
 
 
@@ -52,6 +54,7 @@ class Run(NamedTuple):
         task: its domain.
         seed: its seed.
         settings: by their full names, without those that say where it lies.
+        given: the data and the VAE that it was given.
         summary: the whole of it.
         episodes: online episodes before each update, ``[U]``.
         curves: figures of each update's episodes by their name in the metrics, ``[U]`` each.
@@ -63,6 +66,7 @@ class Run(NamedTuple):
     task: str
     seed: int
     settings: dict[str, Any]
+    given: dict[str, Any]
     summary: dict[str, Any]
     episodes: np.ndarray
     curves: dict[str, np.ndarray]
@@ -73,7 +77,7 @@ def run_folders(folders: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
     """The finished runs in folders, and those that are not.
 
     Args:
-        folders: of runs, or with runs anywhere below them; VAEs that runs share are left out.
+        folders: of runs, or with runs anywhere below them; VAEs that runs share, and evaluations, are left out.
 
     Raises:
         FileNotFoundError: for a folder without any run.
@@ -92,12 +96,19 @@ def run_folders(folders: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
 
 
 def _configurations(folder: Path) -> Iterator[Path]:
+    """Of runs in a folder; what lies within a run, such as its evaluations, is none."""
     if (folder / "config.yaml").is_file():
-        yield folder / "config.yaml"
-        return
-    for path in sorted(folder.rglob("config.yaml")):
-        if "shared" not in path.relative_to(folder).parts:
-            yield path
+        if _is_run(folder):
+            yield folder / "config.yaml"
+    elif folder.is_dir():
+        for inner in sorted(path for path in folder.iterdir() if path.is_dir()):
+            yield from _configurations(inner)
+
+
+def _is_run(folder: Path) -> bool:
+    """Whether a folder with settings is that of a run, and not of a VAE that runs share, or of an evaluation."""
+    shared = folder.resolve().parent.name == "shared" and folder.resolve().name.startswith("vae-")
+    return not shared and not (folder / "vae.pt").is_file() and "run" not in read_yaml(folder / "config.yaml")
 
 
 def read_run(folder: str | Path) -> Run:
@@ -125,6 +136,7 @@ def read_run(folder: str | Path) -> Run:
             f"{_REMEDY}"
         )
     settings = flat(read_yaml(folder / "config.yaml"))
+    given = {name: settings.get(name) for name in GIVEN}
     for name in (*PLACES, "seed"):
         settings.pop(name, None)
     return Run(
@@ -133,6 +145,7 @@ def read_run(folder: str | Path) -> Run:
         task=summary["task"],
         seed=summary["seed"],
         settings=settings,
+        given=given,
         summary=summary,
         episodes=episodes,
         curves=curves,
@@ -177,6 +190,7 @@ def _check_summary(summary: Mapping[str, Any], path: Path) -> None:
     require(isinstance(summary.get("task"), str), "the name of a task")
     require(isinstance(summary.get("algorithm", "ls3"), str), "the name of an algorithm")
     require(type(summary.get("seed")) is int, "a seed")
+    require(type(summary.get("minutes")) in (int, float), "its minutes")
     for part in ("demonstrations", "online", "evaluation"):
         if part in summary:
             for _, name, *_ in FIGURES:

@@ -102,22 +102,23 @@ def _draw(part: Part, output: Path) -> None:
     plots: dict[str, Any] = {"learning": lambda: plot_learning(groups, paths["learning"])}
     if has_rollouts(groups):
         plots = {"rollouts": lambda: plot_rollouts(groups, paths["rollouts"])} | plots
-    if (name := swept(groups)) is not None:
-        plots["sensitivity"] = lambda: plot_sensitivity(groups, name, paths["sensitivity"])
+    if (setting := swept(groups)) is not None:
+        plots["sensitivity"] = lambda: plot_sensitivity(groups, setting, paths["sensitivity"])
     mapped = next((group.runs[0] for group in groups if group.algorithm == "ls3"), None)
     if mapped is not None and has_maps(mapped):
         plots["maps"] = lambda: plot_maps(mapped, paths["maps"])
-    for group in groups:
-        plots[f"films of {group.title}"] = lambda group=group: part.films.extend(
-            (group.title, film) for film in films_of(group.runs, output, _slug(f"{part.task}-{group.title}"))
+    for number, group in enumerate(groups, start=1):
+        name = _slug(f"{part.task}-{number}-{group.title}")
+        plots[f"films of {group.title}"] = lambda group=group, name=name: part.films.extend(
+            (group.title, film) for film in films_of(group.runs, output, name)
         )
     failed = draw(plots)
     part.pictures = {name: paths[name] for name in plots if name in paths and name not in failed}
 
 
 def _slug(text: str) -> str:
-    """A text as the name of a file."""
-    return re.sub(r"[^\w.+-]+", "_", text, flags=re.ASCII)
+    """A text as the beginning of a file's name, which must not be too long."""
+    return re.sub(r"[^\w.+-]+", "_", text, flags=re.ASCII)[:120]
 
 
 def _page(

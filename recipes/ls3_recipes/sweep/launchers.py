@@ -61,11 +61,14 @@ class Local(Launcher):
         self._free = self._shares()
 
     def _shares(self) -> list[set[int]]:
-        """The cores of each worker; none where they cannot be chosen, or not everyone gets enough of its own."""
+        """The cores of each worker; none where they cannot be chosen, or the workers do not take just all of them.
+
+        Where cores are left, another sweep would choose the same ones.
+        """
         if not hasattr(os, "sched_setaffinity"):  # on macOS and Windows
             return [set() for _ in range(self.slots)]
         cores = sorted(os.sched_getaffinity(0))
-        if len(cores) < self.slots * self._threads:
+        if len(cores) != self.slots * self._threads:
             return [set() for _ in range(self.slots)]
         return [set(cores[i * self._threads : (i + 1) * self._threads]) for i in range(self.slots)]
 
@@ -176,12 +179,16 @@ class Slurm(Launcher):
     partition: str | None = None
     gpus: int = 0
     memory_gb: float | None = None
-    parameters: dict[str, Any] = field(default_factory=dict)
+    parameters: Any = field(default_factory=dict)
     cluster: str = "slurm"
 
     def __post_init__(self) -> None:
         """Prepare the submissions."""
         require_at_least(self.threads, 1, "threads")
+        if not isinstance(self.parameters, Mapping):
+            raise TypeError(
+                f"parameters must be names with values, such as {{slurm_account: NAME}}; got {self.parameters!r}."
+            )
         try:
             import submitit
         except ModuleNotFoundError:

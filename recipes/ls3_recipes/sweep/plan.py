@@ -8,18 +8,23 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
 
 from ls3_envs.registry import domain
 from ls3_recipes.arguments import name_in
 from ls3_recipes.configuration import checked_settings, settings_class_of
+from ls3_recipes.options import as_dict
 from ls3_recipes.overrides import parse
 from ls3_recipes.renamed import rename_overrides
+from ls3_recipes.report.reading import GIVEN, PLACES, flat
 from ls3_recipes.run_settings import RunSettings
 
 #: What separates the parts of a run's name from what file systems may not have.
 _UNUSUAL = re.compile(r"[^\w.=,+-]+")
 #: Settings that every name has, the first by its value alone.
 _ALWAYS = ("algorithm", "task")
+#: Settings of a run that a sweep decides.
+_OF_THE_SWEEP = ("output", "resume")
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,22 @@ def planned_runs(
                     "arms."
                 )
             runs.setdefault(name, PlannedRun(name, overrides, made))
+    _require_different(runs.values())
     return sorted(runs.values(), key=lambda run: run.settings.seed)
+
+
+def _require_different(runs: Iterable[PlannedRun]) -> None:
+    """Refuse runs that differ in nothing but where they lie and what they are computed on."""
+    seen: dict[str, PlannedRun] = {}
+    for run in runs:
+        settings = flat(as_dict(run.settings))
+        what = repr({name: value for name, value in settings.items() if name not in PLACES or name in GIVEN})
+        other = seen.setdefault(what, run)
+        if other is not run:
+            raise ValueError(
+                f"Two runs of the sweep would do the same: {' '.join(other.overrides)} and {' '.join(run.overrides)}. "
+                "Leave one out."
+            )
 
 
 def _require_horizon(settings: RunSettings) -> None:
@@ -106,10 +126,17 @@ def _combinations(
 
 def _values(override: Override) -> list[str]:
     """An argument as Hydra reads it, once for each of its values."""
+    if override.get_key_element().lstrip("+~") in _OF_THE_SWEEP:
+        raise ValueError(f"{override.input_line}: the sweep itself says where its runs go. Leave it out of the arms.")
     if not override.is_sweep_override():
         return [str(override.input_line)]
     key = override.get_key_element()
-    return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    try:
+        return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    except HydraException as error:
+        raise ValueError(
+            f"{override.input_line}: {error}. Write the values of {key} as A,B or range(FROM,TO) or choice(A,B)."
+        ) from None
 
 
 def _name_of(settings: RunSettings, shown: Sequence[tuple[str, str]]) -> str:

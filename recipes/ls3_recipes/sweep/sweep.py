@@ -14,6 +14,7 @@ from ls3_recipes.console import console
 from ls3_recipes.extra import Job as Command
 from ls3_recipes.interrupts import Interrupts
 from ls3_recipes.options import as_dict
+from ls3_recipes.resume import require_same_settings
 from ls3_recipes.run_files import require_folder
 from ls3_recipes.run_folder import Lock
 from ls3_recipes.sweep import JobsFailedError
@@ -40,7 +41,7 @@ def sweep(settings: SweepSettings, overrides: Sequence[str] = (), files: str | N
 
     Raises:
         ValueError: for a setting that no run can have, before any begins.
-        FileExistsError: while another process is at this sweep.
+        FileExistsError: while another process is at this sweep, or where runs of other settings lie in its folder.
         JobsFailedError: at the end, when jobs have failed; the others are finished.
         Interrupted: for Ctrl-C or SIGTERM, when every run has saved its state.
     """
@@ -48,6 +49,9 @@ def sweep(settings: SweepSettings, overrides: Sequence[str] = (), files: str | N
     require_folder(output, "output")
     runs = planned_runs(settings.arms, settings.settings, overrides, folder=files)
     jobs = jobs_of(runs, output, settings.rollouts)
+    for run in runs:
+        if (jobs[run.name].folder / "config.yaml").is_file():
+            require_same_settings(jobs[run.name].folder, as_dict(run.settings))
     launcher = make_launcher(settings.launcher, output)
     output.mkdir(parents=True, exist_ok=True)
     lock = Lock(output / "lock")
@@ -66,9 +70,8 @@ def sweep(settings: SweepSettings, overrides: Sequence[str] = (), files: str | N
                 raise
         launcher.close()
         _tell(index, output)
-        finished = [str(jobs[run.name].folder) for run in runs if index.states[run.name] == FINISHED]
-        if finished:
-            write_report(finished, output / "report", settings.title, index.errors)
+        if FINISHED in (index.states[run.name] for run in runs):
+            _report(output, settings.title, index)
     finally:
         lock.release()
     failed = [name for name, state in index.states.items() if state in (FAILED, NOT_BEGUN)]
@@ -78,6 +81,15 @@ def sweep(settings: SweepSettings, overrides: Sequence[str] = (), files: str | N
             "Remove the cause and start the sweep again: what is finished is left as it is."
         )
     return index
+
+
+def _report(output: Path, title: str, index: Index) -> None:
+    """Report all runs that lie there, of earlier calls as well; what hinders it costs no run anything."""
+    try:
+        write_report([output / "runs"], output / "report", title, index.errors)
+    except (ValueError, TypeError, KeyError, OSError) as error:
+        reason = " ".join(str(error).split())
+        console.print(f"There is no report: {reason}", markup=False, soft_wrap=True)
 
 
 def _tell(index: Index, output: Path) -> None:

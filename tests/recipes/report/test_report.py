@@ -122,6 +122,36 @@ def test_runs_that_differ_in_seeds_alone_are_one_group(tmp_path):
         grouped([*runs, runs[0]], LABELS)
 
 
+def test_groups_that_differ_in_many_settings_have_titles_and_films_of_their_own(tmp_path):
+    many = {"horizon": 5, "num_candidates": 20, "num_particles": 4}
+    runs = [read_run(make_run(tmp_path / "first", "ls3", 0, [1.0], horizon=1, num_candidates=9, num_particles=1))]
+    runs += [read_run(make_run(tmp_path / f"{r}", "ls3", 0, [1.0], **many, relaxation=r)) for r in (0.5, 0.8)]
+    titles = [group.title for group in grouped(runs, LABELS)]
+    assert len({*titles}) == 3
+
+
+def test_runs_of_one_seed_on_other_data_are_groups_of_their_own(tmp_path):
+    runs = []
+    for name, seed in (("a", 0), ("b", 0), ("a", 1)):
+        folder = make_run(tmp_path / f"{name}{seed}", "ls3", seed, [1.0])
+        settings = yaml.safe_load((folder / "config.yaml").read_text()) | {"data": f"/data/{name}"}
+        (folder / "config.yaml").write_text(yaml.safe_dump(settings))
+        runs.append(read_run(folder))
+    assert [len(group.runs) for group in grouped(runs, LABELS)] == [2, 1]
+    assert [len(group.runs) for group in grouped(runs[1:], LABELS)] == [2]  # every seed may have data of its own
+
+
+def test_evaluations_and_shared_vaes_are_no_runs_and_folders_may_have_any_name(tmp_path):
+    run = make_run(tmp_path / "shared" / "x", "ls3", 0, [1.0])
+    for folder in (run / "evaluation", tmp_path / "evaluated"):
+        folder.mkdir()
+        (folder / "config.yaml").write_text(f"run: {run}\nagent: agent.pt\n")
+        (folder / "summary.json").write_text("{}")
+    make_run(tmp_path / "shared" / "vae-navigation-seed0-00000000", "ls3", 0, [1.0])
+    assert run_folders([tmp_path]) == ([run], [])
+    assert run_folders([tmp_path / "shared"]) == ([run], [])
+
+
 def test_the_table_by_hand(tmp_path):
     runs = [
         read_run(make_run(tmp_path / "b0", "bc", 0, [1.0, 1.0], evaluation=-84.0)),
@@ -144,7 +174,7 @@ def test_the_page_holds_everything_and_fetches_nothing(tmp_path):
         make_run(tmp_path / f"awac-{seed}", "awac", seed, [0.5], task="reacher", episodes=3)
     (tmp_path / "cut").mkdir()
     (tmp_path / "cut" / "config.yaml").write_text("seed: 3\n")
-    make_run(tmp_path / "shared" / "vae", "ls3", 9, [1.0])
+    make_run(tmp_path / "shared" / "vae-x", "ls3", 9, [1.0])
     write_report([tmp_path], tmp_path / "report", "A <sweep>", {"broken": "no <room>"})
     page = Page(tmp_path / "report" / "report.html")
     text = " ".join(page.words)

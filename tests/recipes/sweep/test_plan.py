@@ -55,6 +55,23 @@ def test_two_runs_of_one_name_are_refused():
         planned_runs([["task.horizon=12"], ["planner.horizon=12"]], ["seed=0"], ["preset=smoke"])
 
 
+@pytest.mark.parametrize(
+    ("arms", "given"),
+    [([[]], "threads=1,2"), ([[]], "pictures=true,false"), ([["planner.horizon=3"], []], "seed=0")],
+)
+def test_two_runs_that_would_do_the_same_are_refused(arms, given):
+    with pytest.raises(ValueError, match="would do the same"):
+        planned_runs(arms, [], ["preset=smoke", given])
+
+
+def test_values_that_are_no_list_are_refused_with_how_to_write_them():
+    for given in ("seed=glob(*)", "seed=interval(0,3)"):
+        with pytest.raises(ValueError, match=r"Write the values of seed as A,B or range"):
+            planned_runs([[]], [], ["preset=smoke", given])
+    with pytest.raises(ValueError, match="output=x: the sweep itself says where its runs go"):
+        planned_runs([["output=x"]], [], ["preset=smoke"])
+
+
 def test_runs_of_one_seed_share_what_they_do_not_differ_in(tmp_path):
     runs = planned_runs([*ARMS, ["algorithm=ls3", "vae.beta=0.1"]], ["seed=0,1"], ["preset=smoke"])
     jobs = jobs_of(runs, tmp_path, rollouts=5)

@@ -48,7 +48,7 @@ def jobs(folder):
         return {row["name"]: row for row in csv.DictReader(file)}
 
 
-@pytest.mark.parametrize("algorithm", ["ls3", "awac"])
+@pytest.mark.parametrize("algorithm", ["ls3", "sacfd", "awac"])
 def test_a_run_with_a_shared_vae_ends_in_the_bits_of_one_that_makes_its_own(tmp_path, algorithm):
     how = [*TINY, f"algorithm={algorithm}", "vae.prediction_weight=1.0"]
     run_experiment(train_settings(*how, f"output={tmp_path / 'alone'}"))
@@ -62,6 +62,14 @@ def test_a_run_with_a_shared_vae_ends_in_the_bits_of_one_that_makes_its_own(tmp_
     assert all(torch.equal(one[name], other[name]) for name in one)
     first, second = (read_json(tmp_path / name / "summary.json") for name in ("alone", "with"))
     assert first["evaluation"] == second["evaluation"]
+
+
+def test_every_algorithm_trains_the_same_vae(tmp_path):
+    weights = []
+    for name in ("ls3", "sacfd", "awac", "bc"):
+        path = train_vae(train_settings(*TINY, f"algorithm={name}", f"output={tmp_path / name}"))
+        weights.append(LS3Agent.load(path).encoder.state_dict())
+    assert all(torch.equal(weights[0][key], other[key]) for other in weights[1:] for key in other)
 
 
 def test_a_shared_vae_says_what_it_is(tmp_path):
@@ -96,6 +104,10 @@ def test_a_sweep_goes_on_where_it_was_killed_and_ends_with_the_same_figures(tmp_
     before = (tmp_path / "killed" / "runs").stat().st_mtime_ns
     finished(ls3("sweep", *arms, f"output={tmp_path / 'killed'}", cwd=tmp_path))  # nothing is left
     assert (tmp_path / "killed" / "runs").stat().st_mtime_ns == before
+    changed = ls3("sweep", *arms, "planner.num_candidates=30", f"output={tmp_path / 'killed'}", cwd=tmp_path)
+    assert "holds a run of other settings: planner.num_candidates=20 there, 30 here" in finished(changed, status=1)
+    slurm = "hydra/launcher=slurm", "hydra.launcher.cluster=local", "hydra.launcher.threads=1"
+    finished(ls3("sweep", *arms, *slurm, f"output={tmp_path / 'killed'}", cwd=tmp_path))
     assert not (tmp_path / "runs").exists()
     assert not (tmp_path / "multirun").exists()
 
