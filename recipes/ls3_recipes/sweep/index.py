@@ -20,7 +20,7 @@ WAITING, RUNNING, FINISHED, FAILED, CUT_OFF, NOT_BEGUN = (
 
 
 class Index:
-    """State and outcome of every job.
+    """State and outcome of every job; those that earlier calls named are kept in the table.
 
     Args:
         path: of the table, in CSV.
@@ -32,6 +32,7 @@ class Index:
         self.states = dict.fromkeys(self._jobs, WAITING)
         self.errors: dict[str, str] = {}
         self._outcomes: dict[str, dict[str, str]] = {}
+        self._earlier = [row for row in _rows_of(path) if row["name"] not in self._jobs]
 
     def set(self, states: Mapping[str, str], errors: Mapping[str, str] | None = None) -> None:
         """Change the states of some jobs, and write the table."""
@@ -43,6 +44,7 @@ class Index:
         rows = csv.DictWriter(text, COLUMNS)
         rows.writeheader()
         rows.writerows(self._row(job) for job in self._jobs.values())
+        rows.writerows(self._earlier)
         save_text_atomically(text.getvalue(), self.path)
 
     def _row(self, job: Job) -> dict[str, str]:
@@ -55,6 +57,18 @@ class Index:
             "arguments": " ".join(job.arguments),
             **self._outcomes.get(job.name, {}),
         }
+
+
+def _rows_of(path: Path) -> list[dict[str, str]]:
+    """What an earlier call has written; jobs that were under way were cut off with it."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, ValueError, csv.Error):
+        return []
+    if any(set(row) != set(COLUMNS) or None in row.values() for row in rows):
+        return []  # damaged, or of another version: the folders of the runs are what counts
+    return [row | {"state": CUT_OFF if row["state"] == RUNNING else row["state"]} for row in rows]
 
 
 def outcome_of(job: Job) -> dict[str, str]:

@@ -105,6 +105,23 @@ def test_what_is_finished_is_not_done_again(tmp_path):
     assert launcher.begun == ["b"]
 
 
+def test_the_table_keeps_the_jobs_of_earlier_calls(tmp_path):
+    earlier = [job(tmp_path, "a"), job(tmp_path, "b")]
+    carry_out(tmp_path, earlier, Instant(finish))
+    path = tmp_path / "jobs.csv"
+    path.write_text(path.read_text().replace("b,train,finished", "b,train,running"))  # as a kill leaves it
+    index = carry_out(tmp_path, [job(tmp_path, "c")], Instant(finish))
+    assert index.states == {"c": "finished"}
+    lines = path.read_text().splitlines()
+    assert [line.split(",")[0] for line in lines[1:]] == ["c", "a", "b"]
+    assert "a,train,finished,1.0" in lines[2]
+    assert "b,train,cut off,1.0" in lines[3]
+    for damage in ("name,kind\nd,train\n", "", "\x00", path.read_text() + "one,too,few\n"):
+        path.write_text(damage)
+        carry_out(tmp_path, [job(tmp_path, "c")], Instant(finish))
+        assert path.read_text().splitlines() == lines[:2]
+
+
 def test_ctrl_c_stops_what_is_under_way_and_says_so(tmp_path):
     import os
     import signal
