@@ -6,13 +6,18 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import Future
+from pathlib import Path
 
 import pytest
 import torch
 
+from ls3_recipes.commands.sweep import main
 from ls3_recipes.configuration import train_settings
 from ls3_recipes.protocol import run_experiment, train_vae
 from ls3_recipes.run_files import read_json
+from ls3_recipes.sweep import worker
+from ls3_recipes.sweep.launchers import Launcher
 from ls3_torchrl import LS3Agent
 
 TINY = ["preset=smoke", "device=cpu", "threads=1", "pictures=false"]
@@ -32,6 +37,36 @@ def finished(process, status=0):
     out, _ = process.communicate(timeout=600)
     assert process.returncode == status, out
     return out
+
+
+class Here(Launcher):
+    """Carries out tasks one after another in this process, which spares each the imports."""
+
+    slots = 1
+
+    def submit(self, task):
+        future = Future()
+        try:
+            worker.main([str(os.getppid()), *task.arguments])
+        except SystemExit as error:
+            Path(task.log).parent.mkdir(exist_ok=True)
+            Path(task.log).write_text(str(error))
+            future.set_result(1)
+        else:
+            future.set_result(0)
+        return future
+
+    def stop(self):
+        raise AssertionError("Nothing is under way between two tasks.")
+
+
+@pytest.fixture
+def sweep_here(monkeypatch, tmp_path):
+    """``ls3 sweep`` in this process."""
+    monkeypatch.setattr("ls3_recipes.sweep.sweep.make_launcher", lambda *_: Here())
+    monkeypatch.setattr(worker, "_end_with", lambda _: None)
+    monkeypatch.chdir(tmp_path)
+    return lambda *arguments: main([*map(str, arguments)])
 
 
 def table(folder):
@@ -81,9 +116,9 @@ def test_a_shared_vae_says_what_it_is(tmp_path):
         train_vae(train_settings(*TINY, "algorithm=bc", "encoder=conv", f"output={tmp_path / 'none'}"))
 
 
-def test_a_sweep_goes_on_where_it_was_killed_and_ends_with_the_same_figures(tmp_path):
+def test_a_sweep_goes_on_where_it_was_killed_and_ends_with_the_same_figures(tmp_path, sweep_here):
     arms = ["planner.constraint_threshold=0.3,null", "rollouts=2", *TINY]
-    finished(ls3("sweep", *arms, f"output={tmp_path / 'whole'}", "hydra.launcher.workers=1", cwd=tmp_path))
+    sweep_here(*arms, f"output={tmp_path / 'whole'}")
     killed = ls3("sweep", *arms, f"output={tmp_path / 'killed'}", "hydra.launcher.workers=2", cwd=tmp_path)
     while not any((tmp_path / "killed").glob("runs/*/metrics.csv")):
         assert killed.poll() is None
@@ -102,27 +137,31 @@ def test_a_sweep_goes_on_where_it_was_killed_and_ends_with_the_same_figures(tmp_
     assert "no constraints" in text
     assert not [path for path in (tmp_path / "killed").rglob("*") if path.is_dir() and not any(path.iterdir())]
     before = (tmp_path / "killed" / "runs").stat().st_mtime_ns
-    finished(ls3("sweep", *arms, f"output={tmp_path / 'killed'}", cwd=tmp_path))  # nothing is left
+    sweep_here(*arms, f"output={tmp_path / 'killed'}")  # nothing is left
     assert (tmp_path / "killed" / "runs").stat().st_mtime_ns == before
-    changed = ls3("sweep", *arms, "planner.num_candidates=30", f"output={tmp_path / 'killed'}", cwd=tmp_path)
-    assert "holds a run of other settings: planner.num_candidates=20 there, 30 here" in finished(changed, status=1)
-    slurm = "hydra/launcher=slurm", "hydra.launcher.cluster=local", "hydra.launcher.threads=1"
-    finished(ls3("sweep", *arms, *slurm, f"output={tmp_path / 'killed'}", cwd=tmp_path))
+    with pytest.raises(SystemExit, match=r"other settings: planner\.num_candidates=20 there, 30 here"):
+        sweep_here(*arms, "planner.num_candidates=30", f"output={tmp_path / 'killed'}")
     assert not (tmp_path / "runs").exists()
     assert not (tmp_path / "multirun").exists()
 
 
-def test_a_run_that_fails_is_listed_and_the_others_are_finished(tmp_path):
-    (tmp_path / "out" / "runs" / "ls3-navigation-seed0").mkdir(parents=True)
-    (tmp_path / "out" / "runs" / "ls3-navigation-seed0" / "note.txt").write_text("a folder of someone else's")
-    process = ls3("sweep", *TINY, "seed=0,1", f"output={tmp_path / 'out'}", cwd=tmp_path)
-    out = finished(process, status=1)
+def test_slurm_from_the_command_line(tmp_path):
+    slurm = "hydra/launcher=slurm", "hydra.launcher.cluster=local", "hydra.launcher.threads=1"
+    run = *TINY, "algorithm=bc", "encoder=conv", f"output={tmp_path / 'out'}"
+    finished(ls3("sweep", *run, *slurm, cwd=tmp_path))
+    assert sorted(row["kind"] for row in jobs(tmp_path / "out").values()) == ["data", "train"]
+
+
+def test_a_run_that_fails_is_listed_and_the_others_are_finished(tmp_path, sweep_here, capsys):
+    (tmp_path / "out" / "runs" / "bc-navigation-seed0").mkdir(parents=True)
+    (tmp_path / "out" / "runs" / "bc-navigation-seed0" / "note.txt").write_text("a folder of someone else's")
+    with pytest.raises(SystemExit, match="ls3 sweep: 1 of 4 jobs failed"):
+        sweep_here(*TINY, "algorithm=bc", "encoder=conv", "seed=0,1", f"output={tmp_path / 'out'}")
     rows = jobs(tmp_path / "out")
-    assert rows["ls3-navigation-seed0"]["state"] == "failed"
-    assert "exists already" in rows["ls3-navigation-seed0"]["error"]
-    assert rows["ls3-navigation-seed1"]["state"] == "finished"
-    assert "ls3 sweep: 1 of 6 jobs failed" in out
-    assert "Traceback" not in out
+    assert rows["bc-navigation-seed0"]["state"] == "failed"
+    assert "exists already" in rows["bc-navigation-seed0"]["error"]
+    assert rows["bc-navigation-seed1"]["state"] == "finished"
+    assert "Traceback" not in capsys.readouterr().out
     assert "Failed or not finished" in (tmp_path / "out" / "report" / "report.html").read_text()
 
 
