@@ -35,7 +35,7 @@ run: $(VENV)/run.installed
 	$(BIN)/python recipes/ls3.py task=$(TASK) preset=$(PRESET) seed=$(SEED) $(ARGS)
 
 test: $(VENV)/test.installed
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
 soak: $(VENV)/test.installed
 	$(BIN)/python -m pytest tests/reliability tests/trainers/test_checkpoints.py --soak -s -p no:cacheprovider
