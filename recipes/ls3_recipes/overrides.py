@@ -11,6 +11,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from ls3_recipes.options import defaults, leaves, unknown
+from ls3_recipes.run_files import read_yaml
 from ls3_recipes.typed import did_you_mean
 
 CONF = Path(__file__).parent / "conf"
@@ -63,8 +64,11 @@ def check(
         ValueError: naming the argument, and the nearest that there is.
     """
     seen: dict[str, str] = {}
+    overrides = [*overrides]
     for override in parse(overrides):
         name, line = override.get_key_element().lstrip("+~"), str(override.input_line)
+        if name.startswith("hydra.launcher.") and "hydra/launcher" in groups:
+            _check_launcher(name.removeprefix("hydra.launcher."), overrides)
         if name.startswith(("hydra.", "hydra/")) and name not in groups:
             continue
         if name in seen and seen[name] != line:
@@ -72,7 +76,8 @@ def check(
         seen[name] = line
         if override.is_sweep_override() and not sweeps:
             raise ValueError(
-                f"{line}: one run has one value of {name}. Write a list as {name}=[A,B], or start a run for each value."
+                f"{line}: one run has one value of {name}. Write a list as {name}=[A,B], a text with a comma in quotes "
+                "within quotes, or start a run for each value."
             )
         if name in groups:
             _check_choice(name, override.value(), folder)
@@ -87,6 +92,15 @@ def _check_choice(group: str, value: Any, folder: str | None) -> None:
     if value is not None and str(value) not in choices:
         nearest = did_you_mean(str(value), choices)
         raise ValueError(f"{group} must be one of {', '.join(choices)}; got {str(value)!r}{nearest or '.'}")
+
+
+def _check_launcher(name: str, overrides: Iterable[str]) -> None:
+    """Refuse a setting that the chosen launcher of this project lacks."""
+    given = [value for key, _, value in (o.partition("=") for o in overrides) if key == "hydra/launcher"]
+    path = CONF / "hydra" / "launcher" / f"{given[-1] if given else 'local'}.yaml"
+    known = [*read_yaml(path)] if path.is_file() else []
+    if known and name.partition(".")[0] not in known:
+        raise ValueError(unknown(name, known, "hydra.launcher", [f"hydra.launcher.{key}" for key in known]))
 
 
 def _check_name(name: str, settings: type) -> None:

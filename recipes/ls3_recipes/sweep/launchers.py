@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -194,6 +195,11 @@ class Slurm(Launcher):
         except ModuleNotFoundError:
             message = "hydra/launcher=slurm needs submitit: pip install submitit."
             raise ModuleNotFoundError(message, name="submitit") from None
+        if self.cluster == "slurm" and shutil.which("srun") is None:
+            raise ValueError(
+                "hydra/launcher=slurm submits jobs, but this machine has no srun. Start the sweep on a node of the "
+                "cluster that does, or try it with hydra.launcher.cluster=local."
+            )
         self.slots = 100_000  # Slurm has a queue of its own
         self._jobs: dict[Future[int], Any] = {}
         self._executor = submitit.AutoExecutor(folder=Path(self.folder), cluster=self.cluster)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
 from ls3_envs.registry import domain
@@ -132,11 +132,14 @@ def _values(override: Override) -> list[str]:
         return [str(override.input_line)]
     key = override.get_key_element()
     try:
-        return [f"{key}={value}" for value in override.sweep_string_iterator()]
+        if values := [f"{key}={value}" for value in override.sweep_string_iterator()]:
+            return values
+        wrong = "there is no value in it"
     except HydraException as error:
-        raise ValueError(
-            f"{override.input_line}: {error}. Write the values of {key} as A,B or range(FROM,TO) or choice(A,B)."
-        ) from None
+        wrong = "glob() is not known here" if override.value_type is ValueType.GLOB_CHOICE_SWEEP else str(error)
+    raise ValueError(
+        f"{override.input_line}: {wrong}. Write the values of {key} as A,B or range(FROM,TO) or choice(A,B)."
+    )
 
 
 def _name_of(settings: RunSettings, shown: Sequence[tuple[str, str]]) -> str:

@@ -41,6 +41,13 @@ def test_settings_of_launchers_are_checked(tmp_path):
         make_launcher({"name": "local", "workers": "all"}, tmp_path)
 
 
+def test_slurm_is_refused_where_there_is_none(tmp_path, monkeypatch):
+    pytest.importorskip("submitit")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ValueError, match=r"no srun.*hydra\.launcher\.cluster=local"):
+        make_launcher({"name": "slurm"}, tmp_path)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["local", "ray", "slurm"])
 def test_a_launcher_tells_how_tasks_ended(tmp_path, name):

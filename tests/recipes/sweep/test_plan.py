@@ -50,6 +50,14 @@ def test_what_no_run_can_have_is_refused_before_any_begins():
         planned_runs(ARMS, [], ["planner.horizon=3"])
 
 
+@pytest.mark.parametrize(
+    ("given", "wrong"), [("seed=range(0)", "no value in it"), ("seed=glob(*)", "glob.. is not known")]
+)
+def test_values_that_are_none_are_refused(given, wrong):
+    with pytest.raises(ValueError, match=rf"{wrong}.*\. Write the values of seed as A,B"):
+        planned_runs([[]], [], [given, "preset=smoke"])
+
+
 def test_two_runs_of_one_name_are_refused():
     with pytest.raises(ValueError, match="would both be called"):  # the last parts of two settings' names
         planned_runs([["task.horizon=12"], ["planner.horizon=12"]], ["seed=0"], ["preset=smoke"])

@@ -183,8 +183,27 @@ def test_refusals_come_before_the_folder(tmp_path):
     assert "planner.horizon must not exceed" in out
     assert len(out.strip().splitlines()) == 1
     assert not (tmp_path / "out").exists()
-    out = finished(ls3("sweep", "hydra/launcher=cloud", cwd=tmp_path), status=1)
-    assert "hydra/launcher must be one of local, ray, slurm; got 'cloud'" in out
-    out = finished(ls3("sweep", "hydra.launcher.worker=2", cwd=tmp_path), status=1)
-    assert "worker" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["hydra/launcher=cloud"], r"hydra/launcher must be one of local, ray, slurm; got 'cloud'"),
+        (["hydra.launcher.worker=2"], r"no setting worker: did you mean hydra\.launcher\.workers\?"),
+        (["hydra/launcher=ray", "hydra.launcher.workers=2"], r"no setting workers.*It has: name, address"),
+        (["title=a,b"], r"one run has one value of title"),
+        (["own", "--config-dir"], r"--config-dir must name a folder"),
+        (["headless", "--config-dir", "mine"], r"headless\.yaml must begin with the line '# @package _global_'"),
+        (["broken", "--config-dir", "mine"], r"broken\.yaml is no YAML"),
+        (["settings={a: 1}", "--config-dir", "mine"], r"settings"),
+    ],
+)
+def test_what_no_sweep_can_have_is_refused_in_one_line(tmp_path, monkeypatch, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine" / "sweep").mkdir(parents=True)
+    (tmp_path / "mine" / "sweep" / "headless.yaml").write_text("title: mine\n")
+    (tmp_path / "mine" / "sweep" / "broken.yaml").write_text(": : [\n")
+    with pytest.raises(SystemExit, match=rf"^ls3 sweep: .*{said}") as error:
+        main(arguments)
+    assert "\n" not in str(error.value)
     assert not (tmp_path / "runs").exists()
