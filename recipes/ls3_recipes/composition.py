@@ -20,6 +20,8 @@ from ls3_recipes.arguments import name_in
 from ls3_recipes.overrides import CONF, GROUPS, parse
 from ls3_recipes.run_files import read_yaml
 
+#: How lines begin that say something to developers of Hydra and OmegaConf alone.
+_NOISE = ("Config search path", "provider=", "full_key:", "object_type=")
 #: What tells Hydra that a file's settings have their full names.
 _GLOBAL = re.compile(r"\A(\s*#.*\n)*\s*#\s*@package\s+_global_\s*$", re.MULTILINE)
 
@@ -76,4 +78,4 @@ def _require_global(folder: Path, choices: Mapping[str, Any]) -> None:
 def reason(error: Exception) -> str:
     """What Hydra or OmegaConf say, on one line and without what only its own users know."""
     lines = [line.strip() for line in str(error.__cause__ or error).splitlines()]
-    return " ".join(line for line in lines if line and not line.startswith(("Config search path", "provider=")))
+    return " ".join(line for line in lines if line and not line.startswith(_NOISE))

@@ -45,13 +45,13 @@ def films_of(runs: Sequence[Run], folder: Path, name: str) -> list[Film]:
         name: of the group, in the films' names.
 
     Returns:
-        Best and worst; nothing where the runs have no episodes any more.
+        Best and worst, one where all went equally well; nothing where the runs have no episodes any more.
     """
     found = list(_episodes(runs))
     if not found:
         return []
-    films = []
-    for word, chosen in (("Best", max(found, key=lambda f: f.rank)), ("Worst", min(found, key=lambda f: f.rank))):
+    films, best, worst = [], max(found, key=lambda f: f.rank), min(found, key=lambda f: f.rank)
+    for word, chosen in (("Best", best), *([("Worst", worst)] if worst.rank < best.rank else [])):
         path = folder / f"{name}-{word.lower()}.mp4"
         save_film(path, _load(chosen.folder)[chosen.row][None])
         films.append(Film(f"{word}: {chosen.text}", path))

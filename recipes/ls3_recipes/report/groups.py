@@ -62,7 +62,8 @@ def grouped(runs: Sequence[Run], labels: Labels) -> list[Group]:
 def _of_algorithm(name: str, runs: Sequence[Run], label: Label) -> list[Group]:
     names = differing([run.settings for run in runs])
     alone = [(run.seed, *(repr(run.settings.get(key)) for key in names)) for run in runs]
-    if len({*alone}) < len(alone):  # runs of one seed that differ in nothing else were given different data
+    whole = [(*one, run.data) for one, run in zip(alone, runs, strict=True)]
+    if len({*alone}) < len(alone) and len({*whole}) == len(whole):  # alike, but for the data that they were given
         runs = [run._replace(settings=run.settings | run.given) for run in runs]
         names = differing([run.settings for run in runs])
     by_settings: dict[tuple[str, ...], list[Run]] = defaultdict(list)

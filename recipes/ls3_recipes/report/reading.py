@@ -54,7 +54,8 @@ class Run(NamedTuple):
         task: its domain.
         seed: its seed.
         settings: by their full names, without those that say where it lies.
-        given: the data and the VAE that it was given.
+        given: the data and the VAE that it was given; of those that a sweep shares out, the sweep's folder.
+        data: a digest of the data that it was given, and the name of the VAE.
         summary: the whole of it.
         episodes: online episodes before each update, ``[U]``.
         curves: figures of each update's episodes by their name in the metrics, ``[U]`` each.
@@ -67,6 +68,7 @@ class Run(NamedTuple):
     seed: int
     settings: dict[str, Any]
     given: dict[str, Any]
+    data: tuple[str | None, str | None]
     summary: dict[str, Any]
     episodes: np.ndarray
     curves: dict[str, np.ndarray]
@@ -136,7 +138,7 @@ def read_run(folder: str | Path) -> Run:
             f"{_REMEDY}"
         )
     settings = flat(read_yaml(folder / "config.yaml"))
-    given = {name: settings.get(name) for name in GIVEN}
+    data, vae = (settings.get(name) for name in GIVEN)
     for name in (*PLACES, "seed"):
         settings.pop(name, None)
     return Run(
@@ -145,12 +147,25 @@ def read_run(folder: str | Path) -> Run:
         task=summary["task"],
         seed=summary["seed"],
         settings=settings,
-        given=given,
+        given={name: _sweep_of(path) for name, path in zip(GIVEN, (data, vae), strict=True)},
+        data=(_digest_of(folder) or data, None if vae is None else "/".join(Path(vae).parts[-2:])),
         summary=summary,
         episodes=episodes,
         curves=curves,
         rollouts=_read_rollouts(folder),
     )
+
+
+def _sweep_of(path: str | None) -> str | None:
+    """The folder of the sweep that shares a file or folder out, or the path as it is."""
+    above = Path(path).parts if path is not None else ()
+    return str(Path(*above[: above.index("shared")])) if "shared" in above[1:] else path
+
+
+def _digest_of(folder: Path) -> str | None:
+    """Of the data that a run was given, as it has noted it."""
+    path = folder / "versions.json"
+    return read_json(path).get("data") if path.is_file() else None
 
 
 def flat(settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:

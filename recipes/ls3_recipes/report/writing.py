@@ -127,9 +127,10 @@ def _page(
     loader = FileSystemLoader(Path(__file__).parent)
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
     presets = ", ".join(sorted({str(run.settings.get("preset")) for run in runs}))
-    hours = sum(run.summary["minutes"] for run in runs) / 60
+    minutes = sum(run.summary["minutes"] for run in runs)
+    took = f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes"
     hardware = sorted({str(run.summary.get("hardware", {}).get("cpu", "unknown")) for run in runs})
-    about = f"{len(runs)} runs, preset {presets}, {hours:.1f} hours in all, on {', '.join(hardware)}"
+    about = f"{len(runs)} runs, preset {presets}, {took} in all, on {', '.join(hardware)}"
     return environment.get_template("page.html.j2").render(
         title=title, about=about, parts=[_shown(part) for part in parts], failures=failures, unfinished=unfinished
     )

@@ -14,8 +14,8 @@ from ls3_torchrl.files import save_text_atomically
 
 COLUMNS = ("name", "kind", "state", "minutes", "success", "violations", "return", "folder", "error", "arguments")
 #: States of a job, in the words of the index.
-WAITING, RUNNING, FINISHED, FAILED, CUT_OFF, NOT_BEGUN = (
-    *("waiting", "running", "finished", "failed", "cut off", "not begun"),
+WAITING, RUNNING, FINISHED, FAILED, CUT_OFF, NOT_BEGUN, NOT_NEEDED = (
+    *("waiting", "running", "finished", "failed", "cut off", "not begun", "not needed"),
 )
 
 

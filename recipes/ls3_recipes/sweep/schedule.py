@@ -11,7 +11,17 @@ from tqdm import tqdm
 
 from ls3_recipes.console import console
 from ls3_recipes.interrupts import Interrupts
-from ls3_recipes.sweep.index import CUT_OFF, FAILED, FINISHED, NOT_BEGUN, RUNNING, WAITING, Index, outcome_of
+from ls3_recipes.sweep.index import (
+    CUT_OFF,
+    FAILED,
+    FINISHED,
+    NOT_BEGUN,
+    NOT_NEEDED,
+    RUNNING,
+    WAITING,
+    Index,
+    outcome_of,
+)
 from ls3_recipes.sweep.jobs import Job
 from ls3_recipes.sweep.launchers import Launcher
 from ls3_recipes.sweep.task import Task
@@ -45,6 +55,7 @@ class Schedule:
             Interrupted: for Ctrl-C, SIGTERM or SIGHUP, when all that was under way has saved its state.
         """
         states = {job.name: FINISHED for job in self._jobs.values() if job.is_done()}
+        states |= dict.fromkeys(self._needless(states), NOT_NEEDED)
         self._index.set(states)
         bar = tqdm(total=len(self._jobs), initial=len(states), desc=f"{'Sweep':<24}", unit="job")
         try:
@@ -60,6 +71,15 @@ class Schedule:
                     self._index.set({job.name: CUT_OFF for job in self._running.values()})
         finally:
             bar.close()
+
+    def _needless(self, done: Mapping[str, str]) -> list[str]:
+        """Data and VAEs that nothing is left to be made from: they may have been deleted since."""
+        needed: set[str] = set()
+        for job in reversed([*self._jobs.values()]):
+            if job.name not in done and (job.kind in ("train", "rollouts") or job.name in needed):
+                needed |= {*job.needs}
+        shared = [job.name for job in self._jobs.values() if job.kind in ("data", "vae")]
+        return [name for name in shared if name not in done and name not in needed]
 
     def _begin(self) -> bool:
         """Begin what can begin; whether anything may still begin later."""

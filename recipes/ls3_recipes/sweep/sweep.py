@@ -15,7 +15,7 @@ from ls3_recipes.extra import Job as Command
 from ls3_recipes.interrupts import Interrupts
 from ls3_recipes.options import as_dict
 from ls3_recipes.resume import require_same_settings
-from ls3_recipes.run_files import require_folder
+from ls3_recipes.run_files import read_yaml, require_folder
 from ls3_recipes.run_folder import Lock
 from ls3_recipes.sweep import JobsFailedError
 from ls3_recipes.sweep.index import FAILED, FINISHED, NOT_BEGUN, Index
@@ -52,9 +52,9 @@ def sweep(settings: SweepSettings, overrides: Sequence[str] = (), files: str | N
     for run in runs:
         if (jobs[run.name].folder / "config.yaml").is_file():
             require_same_settings(jobs[run.name].folder, as_dict(run.settings))
+    _require_own(output)
     launcher = make_launcher(settings.launcher, output)
-    output.mkdir(parents=True, exist_ok=True)
-    lock = Lock(output / "lock")
+    lock = _locked(output)
     try:
         named = as_dict(settings) | {"runs": {run.name: " ".join(run.overrides) for run in runs}}
         save_text_atomically(OmegaConf.to_yaml(OmegaConf.create(named)), output / "sweep.yaml")
@@ -81,6 +81,26 @@ def sweep(settings: SweepSettings, overrides: Sequence[str] = (), files: str | N
             "Remove the cause and start the sweep again: what is finished is left as it is."
         )
     return index
+
+
+def _require_own(output: Path) -> None:
+    """Refuse a folder that holds files of a sweep's names, and no sweep."""
+    there = [name for name in ("sweep.yaml", "jobs.csv", "report") if (output / name).exists()]
+    path = output / "sweep.yaml"
+    if there and not (path.is_file() and {"arms", "runs", "rollouts"} <= read_yaml(path).keys()):
+        raise FileExistsError(
+            f"{output} holds {', '.join(there)}, and no sweep that could go on. Choose another output, so that "
+            "nothing of it is overwritten."
+        )
+
+
+def _locked(output: Path) -> Lock:
+    """The lock of a folder, which is made."""
+    output.mkdir(parents=True, exist_ok=True)
+    try:
+        return Lock(output / "lock")
+    except FileExistsError as error:
+        raise JobsFailedError(str(error)) from None
 
 
 def _report(output: Path, title: str, index: Index) -> None:

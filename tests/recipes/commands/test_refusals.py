@@ -228,7 +228,7 @@ def test_a_device_that_is_not_there_is_refused(at_the_door, command, device):
         (b"# @package _global_\npreset: mine\nvae:\n", "vae is a section, got null: set vae.KEY=VALUE."),
         (b"# @package _global_\npreset: mine\nplaner: {horizon: 3}\n", "The run has no setting planer"),
         (b"- 1\n- 2\n", "mine.yaml must begin with the line '# @package _global_'."),
-        (b"# @package _global_\n- 1\n- 2\n", "mine.yaml"),
+        (b"# @package _global_\n- 1\n- 2\n", "In 'preset/mine': "),
     ],
 )
 def test_what_is_wrong_in_a_users_file_is_named(at_the_door, content, said):

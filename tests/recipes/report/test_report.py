@@ -141,6 +141,23 @@ def test_runs_of_one_seed_on_other_data_are_groups_of_their_own(tmp_path):
     assert [len(group.runs) for group in grouped(runs[1:], LABELS)] == [2]  # every seed may have data of its own
 
 
+def test_a_run_of_two_sweeps_comes_twice_whatever_folders_it_names(tmp_path):
+    runs = []
+    for sweep, seed, digest in (("a", 0, "d0"), ("b", 0, "d0"), ("a", 1, "d1"), ("b", 1, "other")):
+        folder = make_run(tmp_path / f"{sweep}{seed}", "ls3", seed, [1.0])
+        settings = yaml.safe_load((folder / "config.yaml").read_text())
+        settings |= {"data": f"/runs/{sweep}/shared/data-{seed}"}
+        settings |= {"vae": {"checkpoint": f"/runs/{sweep}/shared/vae-{seed}/vae.pt"}}
+        (folder / "config.yaml").write_text(yaml.safe_dump(settings))
+        (folder / "versions.json").write_text(json.dumps({"data": digest}))
+        runs.append(read_run(folder))
+    with pytest.raises(ValueError, match=r"come twice: .*a0, .*b0"):
+        grouped(runs[:3], LABELS)
+    groups = grouped([runs[0], *runs[2:]], LABELS)  # seed 1 on other data: every sweep is a group, not every seed
+    assert [[run.seed for run in group.runs] for group in groups] == [[0, 1], [1]]
+    assert groups[1].changes["data"] == "/runs/b"
+
+
 def test_evaluations_and_shared_vaes_are_no_runs_and_folders_may_have_any_name(tmp_path):
     run = make_run(tmp_path / "shared" / "x", "ls3", 0, [1.0])
     for folder in (run / "evaluation", tmp_path / "evaluated"):

@@ -122,6 +122,21 @@ def test_the_table_keeps_the_jobs_of_earlier_calls(tmp_path):
         assert path.read_text().splitlines() == lines[:2]
 
 
+def test_data_and_vaes_that_were_deleted_are_made_again_for_unfinished_runs_alone(tmp_path):
+    def jobs(*names):
+        of_all = [job(tmp_path, "data", kind="data"), job(tmp_path, "vae", "data", kind="vae")]
+        return [*of_all, *(job(tmp_path, name, "data", "vae") for name in names)]
+
+    save_json_atomically({"minutes": 2.0}, tmp_path / "a" / "summary.json")
+    launcher = Instant(finish)
+    index = carry_out(tmp_path, jobs("a"), launcher)
+    assert launcher.begun == []
+    assert index.states == {"data": "not needed", "vae": "not needed", "a": "finished"}
+    index = carry_out(tmp_path, jobs("a", "b"), launcher)
+    assert launcher.begun == ["data", "vae", "b"]
+    assert set(index.states.values()) == {"finished"}
+
+
 def test_ctrl_c_stops_what_is_under_way_and_says_so(tmp_path):
     import os
     import signal

@@ -16,6 +16,7 @@ from ls3_recipes.commands.sweep import main
 from ls3_recipes.configuration import train_settings
 from ls3_recipes.protocol import run_experiment, train_vae
 from ls3_recipes.run_files import read_json
+from ls3_recipes.run_folder import Lock
 from ls3_recipes.sweep import worker
 from ls3_recipes.sweep.launchers import Launcher
 from ls3_torchrl import LS3Agent
@@ -183,6 +184,19 @@ def test_refusals_come_before_the_folder(tmp_path):
     assert "planner.horizon must not exceed" in out
     assert len(out.strip().splitlines()) == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_something_else_or_in_use_is_refused_as_it_is(tmp_path, sweep_here):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "sweep.yaml").write_text("servers: [a, b]\n")
+    with pytest.raises(SystemExit, match=r"mine holds sweep\.yaml, and no sweep that could go on"):
+        sweep_here(*TINY, f"output={tmp_path / 'mine'}")
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["sweep.yaml"]
+    (tmp_path / "busy").mkdir()
+    lock = Lock(tmp_path / "busy" / "lock")
+    with pytest.raises(SystemExit, match=r"^ls3 sweep: .*busy"):
+        sweep_here(*TINY, f"output={tmp_path / 'busy'}")
+    lock.release()
 
 
 @pytest.mark.parametrize(
