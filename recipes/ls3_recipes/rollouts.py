@@ -29,10 +29,12 @@ def roll_out(run: str | Path, episodes: int) -> None:
         episodes: side by side, of each agent.
 
     Raises:
-        FileNotFoundError: for a folder that holds no run.
+        FileNotFoundError: for a folder that holds no run, or none of its agents any more.
     """
     settings, left = settings_of_run(run), list(agents_left(run, episodes))
     if not left:
+        if not any((Path(run) / "rollouts").glob("agent_*.json")):
+            raise FileNotFoundError(f"{run} has no agents in checkpoints/ any more: there is nothing to roll out.")
         return
     device, seed = choose_device(settings.device), seeds(settings.seed)["rollouts"]
     env = make_env(settings.task, episodes, seed, device)

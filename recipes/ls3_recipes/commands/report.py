@@ -58,7 +58,7 @@ def report(settings: ReportSettings) -> list[dict[str, str]]:
         FileExistsError: when the output folder exists.
     """
     folder, every = require_new(settings.output), []
-    for part in write_report(settings.runs, folder, settings.title):
+    for part in write_report(settings.runs, folder, settings.title).parts:
         rows = figures_of(part.groups)
         every += rows
         table = Table(title=part.task)

@@ -132,7 +132,8 @@ def read_run(folder: str | Path) -> Run:
     rows = [row for row in read_metrics(folder) if row["phase"] == "online"]
     curves = {name: np.array([float(r["value"]) for r in rows if r["name"] == name]) for name, *_ in FIGURES}
     episodes = np.array([int(r["step"]) for r in rows if r["name"] == FIGURES[0][0]], dtype=int)
-    if {len(curve) for curve in curves.values()} != {len(episodes)}:
+    lengths = {len(curve) for curve in curves.values()} | {len(episodes)}
+    if len(lengths) > 1 or (lengths == {0} and "online" in summary):
         raise ValueError(
             f"{folder / 'metrics.csv'} is damaged: its online episodes do not have all of {', '.join(curves)}. "
             f"{_REMEDY}"

@@ -9,11 +9,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from ls3_recipes.algorithms import ALGORITHMS
+from ls3_recipes.console import console
 from ls3_recipes.plots.style import draw
 from ls3_recipes.report.films import Film, films_of
 from ls3_recipes.report.groups import Group, grouped
@@ -60,9 +61,21 @@ class Part:
     films: list[tuple[str, Film]] = field(default_factory=list)
 
 
+class Report(NamedTuple):
+    """What was reported.
+
+    Attributes:
+        parts: what the page says, task by task.
+        left_out: runs that could not be read, with their errors.
+    """
+
+    parts: list[Part]
+    left_out: dict[str, str]
+
+
 def write_report(
     folders: Sequence[str | Path], output: Path, title: str, failures: Mapping[str, str] | None = None
-) -> list[Part]:
+) -> Report:
     """Read runs, and write ``report.html``, pictures, films, ``runs.csv`` and ``curves.csv``.
 
     Args:
@@ -72,18 +85,18 @@ def write_report(
         failures: errors of jobs that failed, by name.
 
     Returns:
-        What the page says, task by task.
+        What the page says, and which runs it leaves out because they are damaged.
 
     Raises:
         FileNotFoundError: for a folder without runs.
-        ValueError: for damaged files, a run that comes twice, or no finished run.
+        ValueError: for a run that comes twice, or no finished run that can be read.
     """
     finished, unfinished = run_folders(folders)
     if not finished:
         raise ValueError(
             f"None of the {len(unfinished)} runs is finished; ls3 train resume={unfinished[0]} goes on with one."
         )
-    runs = [read_run(folder) for folder in finished]
+    runs, left_out = _read(finished)
     tasks = sorted({run.task for run in runs})
     parts = [Part(task, grouped([run for run in runs if run.task == task], LABELS)) for task in tasks]
     output.mkdir(parents=True, exist_ok=True)
@@ -91,9 +104,23 @@ def write_report(
         _draw(part, output)
     _write_csv(output / "runs.csv", [row for part in parts for row in runs_one_by_one(part.groups)])
     _write_csv(output / "curves.csv", [row for part in parts for row in curves_one_by_one(part.groups)])
-    page = _page(title, runs, parts, dict(failures or {}), [str(folder) for folder in unfinished])
+    page = _page(title, runs, parts, {**(failures or {}), **left_out}, [str(folder) for folder in unfinished])
     save_text_atomically(page, output / "report.html")
-    return parts
+    return Report(parts, left_out)
+
+
+def _read(folders: Sequence[Path]) -> tuple[list[Run], dict[str, str]]:
+    """The runs in folders, and what is wrong with those that are damaged."""
+    runs, left_out = [], {}
+    for folder in folders:
+        try:
+            runs.append(read_run(folder))
+        except (ValueError, OSError) as error:
+            left_out[str(folder)] = " ".join(str(error).split())
+            console.print(f"Left out: {left_out[str(folder)]}", markup=False, highlight=False, soft_wrap=True)
+    if not runs:
+        raise ValueError(f"No run can be read: {next(iter(left_out.values()))}")
+    return runs, left_out
 
 
 def _draw(part: Part, output: Path) -> None:

@@ -41,8 +41,9 @@ class Job:
         if self.kind == "data":
             return self.folder.is_dir()
         if self.kind == "rollouts":
-            return is_finished(self.folder) and not any(agents_left(self.folder, int(self.arguments[0])))
-        return is_finished(self.folder)
+            there = any((self.folder / "rollouts").glob("agent_*.json"))
+            return is_finished(self.folder) and there and not any(agents_left(self.folder, int(self.arguments[0])))
+        return is_finished(self.folder) and (self.folder / "config.yaml").is_file()
 
 
 def jobs_of(runs: Iterable[PlannedRun], output: Path, rollouts: int) -> dict[str, Job]:

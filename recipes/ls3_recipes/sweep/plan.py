@@ -126,6 +126,8 @@ def _combinations(
 
 def _values(override: Override) -> list[str]:
     """An argument as Hydra reads it, once for each of its values."""
+    if override.get_key_element().lstrip("+~").startswith("hydra"):
+        raise ValueError(f"{override.input_line}: where a sweep is carried out is an argument of ls3 sweep itself.")
     if override.get_key_element().lstrip("+~") in _OF_THE_SWEEP:
         raise ValueError(f"{override.input_line}: the sweep itself says where its runs go. Leave it out of the arms.")
     if not override.is_sweep_override():

@@ -70,8 +70,7 @@ def sweep(settings: SweepSettings, overrides: Sequence[str] = (), files: str | N
                 raise
         launcher.close()
         _tell(index, output)
-        if FINISHED in (index.states[run.name] for run in runs):
-            _report(output, settings.title, index)
+        reported = FINISHED not in (index.states[run.name] for run in runs) or _report(output, settings.title, index)
     finally:
         lock.release()
     failed = [name for name, state in index.states.items() if state in (FAILED, NOT_BEGUN)]
@@ -80,6 +79,8 @@ def sweep(settings: SweepSettings, overrides: Sequence[str] = (), files: str | N
             f"{len(failed)} of {len(jobs)} jobs failed or could not begin; what they said is in {output / 'logs'}. "
             "Remove the cause and start the sweep again: what is finished is left as it is."
         )
+    if not reported:
+        raise JobsFailedError("all jobs are finished, but not all of their runs could be reported; see above.")
     return index
 
 
@@ -87,6 +88,8 @@ def _require_own(output: Path) -> None:
     """Refuse a folder that holds files of a sweep's names, and no sweep."""
     there = [name for name in ("sweep.yaml", "jobs.csv", "report") if (output / name).exists()]
     path = output / "sweep.yaml"
+    if (output / "config.yaml").is_file():
+        raise FileExistsError(f"{output} is the folder of a run. Choose another output for a sweep.")
     if there and not (path.is_file() and {"arms", "runs", "rollouts"} <= read_yaml(path).keys()):
         raise FileExistsError(
             f"{output} holds {', '.join(there)}, and no sweep that could go on. Choose another output, so that "
@@ -103,13 +106,14 @@ def _locked(output: Path) -> Lock:
         raise JobsFailedError(str(error)) from None
 
 
-def _report(output: Path, title: str, index: Index) -> None:
-    """Report all runs that lie there, of earlier calls as well; what hinders it costs no run anything."""
+def _report(output: Path, title: str, index: Index) -> bool:
+    """Report all runs that lie there, of earlier calls as well; whether none had to be left out."""
     try:
-        write_report([output / "runs"], output / "report", title, index.errors)
-    except (ValueError, TypeError, KeyError, OSError) as error:
+        return not write_report([output / "runs"], output / "report", title, index.errors).left_out
+    except Exception as error:  # whatever hinders it costs no run anything
         reason = " ".join(str(error).split())
         console.print(f"There is no report: {reason}", markup=False, soft_wrap=True)
+        return False
 
 
 def _tell(index: Index, output: Path) -> None:

@@ -215,6 +215,23 @@ def test_the_page_holds_everything_and_fetches_nothing(tmp_path):
     assert (kinds.count("online"), kinds.count("rollouts")) == (14, 12)
 
 
+def test_damaged_runs_are_left_out_and_named(tmp_path, capsys):
+    for seed in range(3):
+        make_run(tmp_path / "runs" / f"{seed}", "ls3", seed, [1.0, 0.5])
+    (tmp_path / "runs" / "0" / "summary.json").write_text("{")
+    (tmp_path / "runs" / "1" / "metrics.csv").write_text("seconds,phase,step,name,value\n")
+    report = write_report([tmp_path / "runs"], tmp_path / "report", "Three")
+    assert [[run.seed for run in group.runs] for part in report.parts for group in part.groups] == [[2]]
+    assert sorted(report.left_out) == [str(tmp_path / "runs" / name) for name in "01"]
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "summary.json is damaged" in page
+    assert "online episodes do not have all of" in page
+    assert capsys.readouterr().out.count("Left out: ") == 2
+    (tmp_path / "runs" / "2" / "summary.json").write_text("{")
+    with pytest.raises(ValueError, match="No run can be read"):
+        write_report([tmp_path / "runs"], tmp_path / "again", "None")
+
+
 def test_the_command_takes_folders(tmp_path, capsys):
     folders = [make_run(tmp_path / "it's, one", "ls3", 0, [1.0]), make_run(tmp_path / "b=2", "awac", 0, [1.0])]
     main([*map(str, folders), f"output={tmp_path / 'report'}"])

@@ -1,15 +1,18 @@
 """Jobs of a sweep, carried out by a launcher that does them in this process."""
 
 from concurrent.futures import Future
+from pathlib import Path
 
 import pytest
 
 from ls3_recipes.interrupts import Interrupts
+from ls3_recipes.rollouts import roll_out
 from ls3_recipes.run_files import read_json
 from ls3_recipes.sweep.index import Index
 from ls3_recipes.sweep.jobs import Job
 from ls3_recipes.sweep.launchers import Launcher
 from ls3_recipes.sweep.schedule import Schedule
+from ls3_recipes.sweep.task import Task
 from ls3_torchrl.files import save_json_atomically
 
 
@@ -32,8 +35,9 @@ class Instant(Launcher):
         self.stopped = True
 
 
-def finish(task):
-    save_json_atomically({"minutes": 1.0}, f"{task.arguments[1]}/summary.json")
+def finish(task, minutes=1.0):
+    save_json_atomically({"minutes": minutes}, f"{task.arguments[1]}/summary.json")
+    Path(task.arguments[1], "config.yaml").touch()
     return 0
 
 
@@ -97,9 +101,21 @@ def test_one_that_says_it_is_done_and_is_not_has_failed(tmp_path):
     assert index.states == {"liar": "failed"}
 
 
+def test_a_run_without_its_settings_or_its_rollouts_is_not_finished(tmp_path):
+    run = job(tmp_path, "a")
+    finish(Task(("train", str(tmp_path / "a")), "", ""))
+    assert run.is_done()
+    rollouts = Job("a-rollouts", "rollouts", tmp_path / "a", ("2",), ("a",))
+    assert not rollouts.is_done()
+    with pytest.raises(FileNotFoundError, match="no run: config"):
+        roll_out(tmp_path / "nowhere", 2)
+    (tmp_path / "a" / "config.yaml").unlink()
+    assert not run.is_done()
+
+
 def test_what_is_finished_is_not_done_again(tmp_path):
     jobs = [job(tmp_path, "a"), job(tmp_path, "b")]
-    save_json_atomically({"minutes": 2.0}, tmp_path / "a" / "summary.json")
+    finish(Task(("train", str(tmp_path / "a")), "", ""), minutes=2.0)
     launcher = Instant(finish)
     carry_out(tmp_path, jobs, launcher)
     assert launcher.begun == ["b"]
@@ -127,7 +143,7 @@ def test_data_and_vaes_that_were_deleted_are_made_again_for_unfinished_runs_alon
         of_all = [job(tmp_path, "data", kind="data"), job(tmp_path, "vae", "data", kind="vae")]
         return [*of_all, *(job(tmp_path, name, "data", "vae") for name in names)]
 
-    save_json_atomically({"minutes": 2.0}, tmp_path / "a" / "summary.json")
+    finish(Task(("train", str(tmp_path / "a")), "", ""), minutes=2.0)
     launcher = Instant(finish)
     index = carry_out(tmp_path, jobs("a"), launcher)
     assert launcher.begun == []

@@ -164,6 +164,9 @@ def test_a_run_that_fails_is_listed_and_the_others_are_finished(tmp_path, sweep_
     assert rows["bc-navigation-seed1"]["state"] == "finished"
     assert "Traceback" not in capsys.readouterr().out
     assert "Failed or not finished" in (tmp_path / "out" / "report" / "report.html").read_text()
+    (tmp_path / "out" / "runs" / "bc-navigation-seed1" / "summary.json").write_text("{")
+    with pytest.raises(SystemExit, match="not all of their runs could be reported"):
+        sweep_here(*TINY, "algorithm=bc", "encoder=conv", "seed=1", f"output={tmp_path / 'out'}")
 
 
 def test_ctrl_c_saves_every_run(tmp_path):
@@ -210,6 +213,7 @@ def test_a_folder_of_something_else_or_in_use_is_refused_as_it_is(tmp_path, swee
         (["headless", "--config-dir", "mine"], r"headless\.yaml must begin with the line '# @package _global_'"),
         (["broken", "--config-dir", "mine"], r"broken\.yaml is no YAML"),
         (["settings={a: 1}", "--config-dir", "mine"], r"settings"),
+        (["settings=['hydra.launcher.workers=1']"], r"an argument of ls3 sweep itself"),
     ],
 )
 def test_what_no_sweep_can_have_is_refused_in_one_line(tmp_path, monkeypatch, arguments, said):
