@@ -48,11 +48,11 @@ class ActorCriticSettings(PolicySettings):
     """
 
     penalty: float
-    initial_std: float = 0.3
-    tau: float = 0.05
+    initial_std: float = 1.0
+    tau: float = 0.005
     zero_at_goal: bool = False
     critic_steps: int = 5000
-    updates_per_step: float = 2.0
+    updates_per_step: float = 1.0
 
     def __post_init__(self) -> None:
         """Refuse what would only fail after time was spent."""
@@ -72,12 +72,12 @@ class BaselineSettings(RunSettings):
     """What a run of a baseline has, in addition to what every run has.
 
     Args:
-        encoder: ``"latents"``, the means of the VAE that LS³ trains, frozen; or ``"conv"``, convolutions of each
-            network's own, with which nothing reads ``agent`` and ``vae``.
+        encoder: ``"conv"``, convolutions of each network's own, with which nothing reads ``agent`` and ``vae``; or
+            ``"latents"``, the means of the VAE that LS³ trains, frozen.
         policy: of the actor and, where it has them, its critics.
     """
 
-    encoder: Literal["latents", "conv"] = "latents"
+    encoder: Literal["latents", "conv"] = "conv"
     policy: PolicySettings
 
     def __post_init__(self) -> None:
@@ -114,7 +114,7 @@ class RiskSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class SACfDPolicySettings(ActorCriticSettings):
-    """Actor and critics of soft actor-critic.
+    """Actor and critics of soft actor-critic; the defaults are those of the implementation that the paper cites.
 
     Args:
         alpha: weight of the entropy, for rewards of -1 a step; above 0.
@@ -122,7 +122,7 @@ class SACfDPolicySettings(ActorCriticSettings):
         risk: of the safety critic, which there is with recovery alone.
     """
 
-    alpha: float = 0.02
+    alpha: float = 0.2
     learn_alpha: bool = False
     risk: RiskSettings
 
@@ -151,18 +151,16 @@ class SACfDSettings(BaselineSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class AWACPolicySettings(ActorCriticSettings):
-    """Actor and critic, with the authors' values.
-
-    Faster critics diverge here: they also learn from violating data, whose actions are not the actor's.
+    """Actor and critic; the defaults are those of the implementation that the paper cites.
 
     Args:
         temperature: by which advantages are divided before they weigh what is imitated; above 0.
     """
 
-    tau: float = 0.005
-    updates_per_step: float = 1.0
+    batch_size: int = 1024
     cloning_steps: int = 0
-    temperature: float = 1.0
+    initial_std: float = 0.05
+    temperature: float = 2.0
 
     def __post_init__(self) -> None:
         """Refuse what would only fail after time was spent."""
