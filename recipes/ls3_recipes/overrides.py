@@ -16,7 +16,11 @@ from ls3_recipes.typed import did_you_mean
 
 CONF = Path(__file__).parent / "conf"
 #: Folders of ``conf/`` whose files can be chosen, by command.
-GROUPS = {"train": ("algorithm", "task", "preset", "tuned", "comparison"), "collect": ("task",), "sweep": ("sweep", "hydra/launcher")}
+GROUPS = {
+    "train": ("algorithm", "task", "preset", "tuned", "comparison"),
+    "collect": ("task",),
+    "sweep": ("sweep", "hydra/launcher"),
+}
 
 
 def parse(overrides: Iterable[str]) -> list[Override]:
