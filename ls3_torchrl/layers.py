@@ -102,17 +102,16 @@ def fastest_precision(device_type: str) -> Literal["fp32", "bf16"]:
     """Choose by measuring a layer of the heads' size; CUDA takes bf16, other devices what is clearly faster."""
     if device_type != "cpu":
         return "bf16" if device_type == "cuda" and torch.cuda.is_bf16_supported() else "fp32"
-    seconds = {}
     # From a stream of its own: what is measured once a process must not move the numbers that training draws.
     own = torch.Generator().manual_seed(0)
-    for dtype in (torch.float32, torch.bfloat16):
-        x, weight, bias = (torch.randn(size, generator=own).to(dtype) for size in ((2048, 256), (256, 256), (256,)))
-        layers = [(weight, bias)] * 3
-        run_layers(x, layers)
-        times = []
-        for _ in range(5):
-            start = time.perf_counter()
-            run_layers(x, layers)
-            times.append(time.perf_counter() - start)
-        seconds[dtype] = min(times)
-    return "bf16" if seconds[torch.bfloat16] < 0.67 * seconds[torch.float32] else "fp32"
+    x, weight, bias = (torch.randn(size, generator=own) for size in ((2048, 256), (256, 256), (256,)))
+    inputs = {
+        dtype: (x.to(dtype), [(weight.to(dtype), bias.to(dtype))] * 3) for dtype in (torch.float32, torch.bfloat16)
+    }
+    seconds: dict[torch.dtype, list[float]] = {dtype: [] for dtype in inputs}
+    for _ in range(8):
+        for dtype, (rows, layers) in inputs.items():
+            start = time.process_time()  # of CPU time, in turns: what else runs must not decide
+            run_layers(rows, layers)
+            seconds[dtype].append(time.process_time() - start)
+    return "bf16" if min(seconds[torch.bfloat16]) < 0.67 * min(seconds[torch.float32]) else "fp32"
