@@ -19,6 +19,7 @@ NEEDED = (
     "ls3_recipes/conf/preset/cpu.yaml",
     "ls3_recipes/conf/task/navigation.yaml",
     "ls3_recipes/conf/tuned/pushing-cpu.yaml",
+    "ls3_recipes/conf/comparison/sacfd-cpu.yaml",
     "ls3_recipes/conf/sweep/figure1.yaml",
     "ls3_recipes/conf/hydra/launcher/ray.yaml",
     "ls3_recipes/report/page.html.j2",

@@ -290,7 +290,10 @@ def slow_demonstrator(td):
 @pytest.mark.parametrize(
     ("algorithm_class", "own"),
     # An advantage is a fraction of a step here, and there are hundreds of gradient steps, not thousands.
-    [(SACfD, []), (AWAC, ["policy.temperature=0.1", "policy.tau=0.05"])],
+    [
+        (SACfD, ["policy.alpha=0.02", "policy.tau=0.05", "policy.initial_std=0.3"]),
+        (AWAC, ["policy.temperature=0.1", "policy.tau=0.05", "policy.initial_std=0.3"]),
+    ],
 )
 def test_from_slow_demonstrations_to_a_quick_agent(recorder, algorithm_class, own):
     # No wall and λ = 0: what is left is to reach the goal, and sooner than the demonstrator.
