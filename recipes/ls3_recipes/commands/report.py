@@ -61,10 +61,10 @@ def report(settings: ReportSettings) -> list[dict[str, str]]:
     for part in write_report(settings.runs, folder, settings.title).parts:
         rows = figures_of(part.groups)
         every += rows
-        table = Table(title=part.task)
+        table = Table(title=f"{part.task}, evaluation")
         shown = [name for name in rows[0] if not name.startswith("online")]
         for name in shown:
-            table.add_column(name.replace(" ", "\n", 1), justify="left" if name == "algorithm" else "right")
+            table.add_column(name.removeprefix("evaluation ").replace(" ", "\n", 1), justify="left" if name == "algorithm" else "right")
         for row in rows:
             table.add_row(*(row[name] for name in shown))
         console.print(table)

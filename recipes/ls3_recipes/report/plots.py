@@ -27,6 +27,8 @@ def plot_learning(groups: Sequence[Group], path: Path) -> None:
                     _curve(axis, group, episodes, estimate(values, trimmed=trimmed))
         for axis, title in zip(axes, (*TITLES, "Violating episodes so far"), strict=True):
             axis.set(title=title, xlabel="online episodes")
+        most = max(1.0, axes[-1].get_ylim()[1])
+        axes[-1].set_ylim(-0.03 * most, most)  # no violation is a line at the bottom, and no ups and downs round 0
         _finish(figure, axes, groups)
 
 
