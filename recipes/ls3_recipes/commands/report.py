@@ -64,7 +64,8 @@ def report(settings: ReportSettings) -> list[dict[str, str]]:
         table = Table(title=f"{part.task}, evaluation")
         shown = [name for name in rows[0] if not name.startswith("online")]
         for name in shown:
-            table.add_column(name.removeprefix("evaluation ").replace(" ", "\n", 1), justify="left" if name == "algorithm" else "right")
+            heading = name.removeprefix("evaluation ").replace(" ", "\n", 1)
+            table.add_column(heading, justify="left" if name == "algorithm" else "right")
         for row in rows:
             table.add_row(*(row[name] for name in shown))
         console.print(table)
