@@ -39,8 +39,8 @@ CAPTIONS = {
     ),
     "maps": (
         "What the agent knew",
-        "Value, safe set and constraint over the plane, and where the agent went in the episodes that followed. Values from "
-        "low (dark) to high (light), on a scale of each map's own; probabilities from 0 (pale) to 1.",
+        "Value, safe set and constraint over the plane, and where the agent went in the episodes that followed. Values "
+        "from low (dark) to high (light), on a scale of each map's own; probabilities from 0 (pale) to 1.",
     ),
 }
 
