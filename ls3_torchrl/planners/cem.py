@@ -15,17 +15,19 @@ from ls3_torchrl.planners.optimizer import NoiseSource, Optimizer, OptimizerResu
 
 
 class _Elites(NamedTuple):
-    """The best feasible sequences of b rows.
+    """The best sequences of b rows: feasible ones, or where there are none those that rank best otherwise.
 
     Attributes:
         actions: best first, ``[b, E, H, A]``; where fewer are feasible, the rest is filled up with others.
-        score: ``[b, E]``, −∞ for those that fill up.
-        any: bool ``[b]``, whether anything is feasible.
+        score: ``[b, E]``, −∞ for those that fill up; the fallback ranking where nothing is feasible.
+        feasible: bool ``[b]``, whether anything is.
+        restart: bool ``[b]``, whether the row is to start again.
     """
 
     actions: Tensor
     score: Tensor
-    any: Tensor
+    feasible: Tensor
+    restart: Tensor
 
 
 @dataclass
@@ -65,9 +67,10 @@ class CrossEntropyMethod:
 
     In the first round ``p_random`` of the candidates are uniform in the box, ``p_constant`` of them hold one
     uniform action, and the rest come from the given Gaussian; later rounds sample the refitted one, clamped to
-    the box. A row in which nothing is feasible starts again from its first round, up to ``max_restarts`` times;
-    after that it takes the sequence with the best fallback ranking (unless an earlier round had found a feasible
-    one). The outcome is the best sequence that was scored: no iteration is sampled without being scored.
+    the box. A row in which nothing is feasible goes on among the sequences with the best fallback ranking, or starts
+    again from its first round, up to ``max_restarts`` times, where ``score_plans`` wants it to. The outcome is the best
+    feasible sequence that was scored, or if there was none the one with the best fallback ranking: no iteration is
+    sampled without being scored.
 
     An :class:`~ls3_torchrl.planners.Optimizer`; the defaults are Table 1's.
 
@@ -173,8 +176,9 @@ class CrossEntropyMethod:
             scores = score_plans(actions, rows, search.restarts[rows], iteration)
             search.iterations[rows] += 1
             elites = self._select(actions, scores)
+            self._keep_best(search, rows, elites)
             self._refit(search, rows, elites, self.min_std * (high - low))
-            self._restart(search, rows, elites.any, max_restarts, actions, scores.fallback)
+            self._restart(search, rows[elites.restart], max_restarts)
             rows = rows[search.step[rows] < self.optim_steps]
             iteration += 1
         return search.result()
@@ -195,54 +199,49 @@ class CrossEntropyMethod:
         return actions.clamp(low, high)
 
     def _select(self, actions: Tensor, scores: PlanScores) -> _Elites:
-        """The best feasible candidates of each row."""
+        """The best candidates of each row, feasible ones alone where there are any."""
         score = scores.score.float()
         feasible = scores.feasible & (score > -torch.inf)  # False for NaN too
-        score, elite = score.masked_fill(~feasible, -torch.inf).topk(self.num_elites, dim=-1)
+        found = feasible.any(-1)
+        ranking = scores.fallback.float().nan_to_num(nan=-torch.inf)
+        score = torch.where(found[:, None], score.masked_fill(~feasible, -torch.inf), ranking)
+        score, elite = score.topk(self.num_elites, dim=-1)
         best = actions.gather(1, elite[..., None, None].expand(-1, -1, *actions.shape[2:]))
-        return _Elites(best, score, feasible.any(-1))
+        return _Elites(best, score, found, ~found if scores.restart is None else ~found & scores.restart)
+
+    def _keep_best(self, search: _Search, rows: Tensor, elites: _Elites) -> None:
+        """The best sequence of all populations; a feasible one goes before all others."""
+        found = search.found[rows]
+        better = (elites.score[:, 0] > search.best_score[rows]) & (elites.feasible | ~found)
+        better |= (elites.feasible & ~found) | (search.iterations[rows] == 1)
+        search.best[rows[better]] = elites.actions[better, 0]
+        search.best_score[rows[better]] = elites.score[better, 0]
+        search.found[rows[elites.feasible]] = True
 
     def _refit(self, search: _Search, rows: Tensor, elites: _Elites, min_std: Tensor) -> None:
-        """Rows with elites: the Gaussian is refitted on them, and the best sequence so far is kept."""
-        weight = (elites.score > -torch.inf).to(elites.actions)[..., None, None]
+        """Rows that do not start again: their Gaussian is refitted on the elites."""
+        going_on = ~elites.restart
+        search.step[rows[going_on]] += 1
+        ranked = elites.score > -torch.inf
+        weight = ranked.to(elites.actions)[..., None, None]
         weight = weight / weight.sum(1, keepdim=True).clamp(min=1.0)
         mean = (weight * elites.actions).sum(1)
         std = (weight * (elites.actions - mean[:, None]).square()).sum(1).sqrt()
+        refitted = going_on & ranked.any(-1)
+        search.mean[rows[refitted]] = mean[refitted]
+        search.std[rows[refitted]] = torch.maximum(std[refitted], min_std)
 
-        good = rows[elites.any]
-        search.mean[good] = mean[elites.any]
-        search.std[good] = torch.maximum(std[elites.any], min_std)
-        search.found[good] = True
-        search.step[good] += 1
-        better = elites.any & (elites.score[:, 0] > search.best_score[rows])
-        search.best[rows[better]] = elites.actions[better, 0]
-        search.best_score[rows[better]] = elites.score[better, 0]
-
-    def _restart(
-        self, search: _Search, rows: Tensor, any_feasible: Tensor, max_restarts: int, actions: Tensor, fallback: Tensor
-    ) -> None:
-        """Rows without elites: they start again, or are done when they have done so ``max_restarts`` times."""
-        if any_feasible.all():
-            return
-        position = (~any_feasible).nonzero().flatten()
-        none = rows[position]
-        exhausted = search.restarts[none] >= max_restarts
-        again = none[~exhausted]
+    def _restart(self, search: _Search, rows: Tensor, max_restarts: int) -> None:
+        """These rows start again, or are done when they have done so ``max_restarts`` times."""
+        exhausted = search.restarts[rows] >= max_restarts
+        again, done = rows[~exhausted], rows[exhausted]
         search.restarts[again] += 1
         search.step[again] = 0
         search.mean[again], search.std[again] = search.start_mean[again], search.start_std[again]
-        search.step[none[exhausted]] = self.optim_steps
-        lost = position[exhausted & ~search.found[none]]
-        if lost.numel():
-            self._fall_back(search, rows[lost], actions[lost], fallback[lost].float())
-
-    def _fall_back(self, search: _Search, rows: Tensor, actions: Tensor, fallback: Tensor) -> None:
-        """Rows in which nothing was ever feasible take the candidate that ranks best, as wide as they began."""
-        ranking = fallback.nan_to_num(nan=-torch.inf)
-        choice = ranking.argmax(-1)
-        search.best[rows] = actions[torch.arange(len(rows), device=rows.device), choice]
-        search.best_score[rows] = ranking.gather(-1, choice[:, None]).squeeze(-1)
-        search.mean[rows], search.std[rows] = search.best[rows], search.start_std[rows]
+        search.step[done] = self.optim_steps
+        lost = done[~search.found[done]]
+        # As wide as they began: nothing told them where to search.
+        search.mean[lost], search.std[lost] = search.best[lost], search.start_std[lost]
 
 
 def optimizer_or_default(optimizer: Optimizer | None, settings: dict[str, Any], *, owner: type) -> Optimizer:

@@ -40,6 +40,7 @@ from ls3_torchrl.planners.latent_env import LatentEnv
 from ls3_torchrl.planners.optimizer import Optimizer, OptimizerResult, PlanScores
 from ls3_torchrl.planners.scoring import (
     PlanStatistics,
+    ends_inside,
     feasible,
     least_harm,
     objective,
@@ -52,9 +53,10 @@ class LS3Planner(MPCPlannerBase):
     """Model predictive control inside the safe set (section 1.1.1, "Cross Entropy Method").
 
     Maximises E[V(z_H)] + imagined steps in the goal, subject to f_C ≤ δ_C at every imagined step and
-    f_S(z_H) ≥ δ_S. A row in which no plan of a round is feasible multiplies its δ_S by ``relaxation`` and
-    starts again. When the relaxations are used up, it acts on the plan with the fewest predicted violations
-    and the safest end, never at random, and says so under ``("plan", "fallback")``.
+    f_S(z_H) ≥ δ_S. A row in which no plan of a round ends in the safe set multiplies its δ_S by ``relaxation`` and
+    starts again; one in which such plans violate keeps its δ_S and refits on those that violate least. Where nothing
+    feasible was found, it acts on the plan with the fewest predicted violations and the safest end, never at random, and
+    says so under ``("plan", "fallback")``.
 
     Plans for all rows of a batch at once, each with its own δ_S, warm start and reset. Use it as the policy of any
     collector or ``rollout``. An optimiser that starts from the last plan (``p_random`` below 1) needs that plan carried
@@ -76,7 +78,7 @@ class LS3Planner(MPCPlannerBase):
         safe_set_threshold: initial δ_S, a probability strictly between 0 and 1; ``None`` for plans that may end
             anywhere, and are never relaxed.
         constraint_threshold: δ_C, likewise; ``None`` for plans whatever they violate.
-        relaxation: factor on δ_S when nothing is feasible, strictly between 0 and 1.
+        relaxation: factor on δ_S when no plan ends in the safe set, strictly between 0 and 1.
         max_relaxations: how often δ_S may be relaxed in one plan.
         constraint_reduction: over particles, ``"max"`` as the authors' code or ``"mean"``.
         safe_set_reduction: over particles, ``"mean"`` as the authors' code or ``"min"``: every particle must end
@@ -285,6 +287,7 @@ class LS3Planner(MPCPlannerBase):
             objective(statistics, pessimism=self.pessimism, goal_reduction=self.goal_reduction),
             feasible(statistics, safe_set_threshold=threshold, constraint_threshold=limit),
             least_harm(statistics, constraint_threshold=limit, safe_set=inside),
+            restart=~ends_inside(statistics, safe_set_threshold=threshold).any(-1),
         )
 
     @property

@@ -9,17 +9,21 @@ from torch import Tensor
 
 
 class PlanScores(NamedTuple):
-    """How b × N action sequences are rated, each field ``[b, N]``.
+    """How b × N action sequences are rated.
 
     Attributes:
-        score: the objective, higher is better; NaN ranks last, and may stand for any sequence that is not feasible.
-        feasible: bool, whether the sequence may be carried out.
-        fallback: ranking, higher is better, for rows in which nothing is feasible.
+        score: the objective ``[b, N]``, higher is better; NaN ranks last, and may stand for any sequence that is not
+            feasible.
+        feasible: bool ``[b, N]``, whether the sequence may be carried out.
+        fallback: ranking ``[b, N]``, higher is better, for rows in which nothing is feasible.
+        restart: bool ``[b]``, rows that are to start again under easier conditions where nothing is feasible; all of
+            them when ``None``. The others go on among sequences that are not feasible, by their fallback ranking.
     """
 
     score: Tensor
     feasible: Tensor
     fallback: Tensor
+    restart: Tensor | None = None
 
 
 class ScorePlans(Protocol):
@@ -100,8 +104,8 @@ class Optimizer(Protocol):
             high: upper bounds ``[A]``.
             batch: B; 0 is allowed.
             horizon: H.
-            max_restarts: how often a row in which nothing is feasible may start again: each time the planner relaxes
-                its safe set for that row.
+            max_restarts: how often a row that ``score_plans`` wants to start again may do so: each time the planner
+                relaxes its safe set for that row.
             mean: mean of the Gaussian to start from, ``[B, H, A]``; the box's middle when ``None``.
             std: its standard deviation; a quarter of the box's side when ``None``.
             noise: where noise comes from; :meth:`sample_noise` when ``None``.

@@ -55,7 +55,12 @@ def feasible(statistics: PlanStatistics, *, safe_set_threshold: Tensor | float, 
         constraint_threshold: δ_C.
     """
     satisfied = (statistics.constraint_prob <= constraint_threshold).all(-1)
-    return satisfied & (statistics.safe_set_prob >= safe_set_threshold)
+    return satisfied & ends_inside(statistics, safe_set_threshold=safe_set_threshold)
+
+
+def ends_inside(statistics: PlanStatistics, *, safe_set_threshold: Tensor | float) -> Tensor:
+    """Bool ``[*B, N]``: the end lies in the safe set (probability ≥ δ_S); see :func:`feasible`."""
+    return statistics.safe_set_prob >= safe_set_threshold
 
 
 def least_harm(statistics: PlanStatistics, *, constraint_threshold: float, safe_set: bool = True) -> Tensor:

@@ -141,8 +141,8 @@ def test_scores_that_rank_nothing_count_as_infeasible_and_never_leave_the_box(wo
     cem = CrossEntropyMethod(num_candidates=10, num_elites=5, optim_steps=2)
     result = cem(record, LOW, HIGH, batch=1, horizon=2, max_restarts=1)
     assert result.fallback.tolist() == [True]
-    # The only candidate with a ranking wins over those without.
-    assert torch.equal(result.actions[0], record.asked[-1][0][0, 4])
+    # The only candidate with a ranking wins over those without; the first of those that rank alike stays.
+    assert torch.equal(result.actions[0], record.asked[0][0][0, 4])
     assert result.mean.isfinite().all()
     assert result.std.isfinite().all()
 
@@ -162,11 +162,56 @@ def test_nothing_feasible_restarts_and_then_takes_the_best_fallback(max_restarts
     assert result.restarts.tolist() == [max_restarts] * 2
     assert result.iterations.tolist() == [max_restarts + 1] * 2
     assert [asked[2].tolist() for asked in record.asked] == [[k, k] for k in range(max_restarts + 1)]
-    actions, *_, scores = record.asked[-1]
+    actions = torch.cat([asked[0] for asked in record.asked], 1)
+    ranking = torch.cat([asked[-1].fallback for asked in record.asked], 1)
     for row in range(2):
-        best = scores.fallback[row].argmax()
+        best = ranking[row].argmax()
         assert torch.equal(result.actions[row], actions[row, best])
-        assert result.score[row] == scores.fallback[row, best]
+        assert result.score[row] == ranking[row, best]
+
+
+def test_rows_that_need_no_restart_refit_on_the_best_of_what_is_not_feasible():
+    torch.manual_seed(0)
+
+    def never(actions, rows, restarts, iteration):
+        score = torch.zeros(len(rows), 20)
+        ranking = -(actions + 2).square().sum((-1, -2))
+        return PlanScores(score, torch.zeros_like(score, dtype=torch.bool), ranking, torch.tensor([True, False])[rows])
+
+    record = Record(never)
+    cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3)
+    result = cem(record, LOW, HIGH, batch=2, horizon=2, max_restarts=1)
+    assert result.restarts.tolist() == [1, 0]
+    assert result.iterations.tolist() == [2, 3]
+    assert result.fallback.tolist() == [True, True]
+    populations = [(asked[0][asked[1] == 1], asked[-1].fallback[asked[1] == 1]) for asked in record.asked]
+    best = max(float(ranking.max()) for _, ranking in populations)
+    assert result.score[1] == best
+    last, ranking = populations[-1]
+    elites = last[0, ranking[0].topk(5).indices]
+    torch.testing.assert_close(result.mean[1], elites.mean(0))
+    torch.testing.assert_close(result.std[1], elites.std(0, correction=0))
+
+
+def test_a_feasible_sequence_goes_before_a_higher_fallback_of_an_earlier_round():
+    torch.manual_seed(0)
+
+    def only_at_last(actions, rows, restarts, iteration):
+        score = actions[..., 0].sum(-1) - 1e3
+        return PlanScores(
+            score,
+            torch.full_like(score, iteration == 1, dtype=torch.bool),
+            torch.zeros_like(score),
+            torch.zeros(1, dtype=torch.bool),
+        )
+
+    record = Record(only_at_last)
+    cem = CrossEntropyMethod(num_candidates=20, num_elites=5, optim_steps=3)
+    result = cem(record, LOW, HIGH, batch=1, horizon=2)
+    assert result.fallback.tolist() == [False]
+    assert result.restarts.tolist() == [0]
+    actions, *_, scores = record.asked[1]
+    assert torch.equal(result.actions[0], actions[0, scores.score[0].argmax()])
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])

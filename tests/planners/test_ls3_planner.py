@@ -166,7 +166,7 @@ def test_relaxation_and_its_limit_are_settings():
 
 @pytest.mark.parametrize("engine", ["fused", "rollout"])
 def test_without_a_feasible_plan_the_least_harmful_is_taken_not_a_random_one(engine):
-    # Violating everywhere; the end is the safer the further right: the best of the last iteration is known.
+    # Violating everywhere; the end is the safer the further right: the best of all populations is known.
     planner = stub_planner(
         constraint=classifier(ConstraintEstimator, prob=0.9),
         safe_set=classifier(SafeSet, slope=0.5, offset=4.0),
@@ -180,10 +180,22 @@ def test_without_a_feasible_plan_the_least_harmful_is_taken_not_a_random_one(eng
     assert not out["plan", "feasible"].any()
     assert out["plan", "iterations"].flatten().tolist() == [3, 3]
     torch.testing.assert_close(out["plan", "safe_set_threshold"], torch.full((2, 1), 0.8 * 0.8**2))
-    candidates = -1 + 2 * noise.candidates[1][2]
+    candidates = -1 + 2 * torch.cat(list(noise.candidates[1][:3]), 1)
     best = candidates[..., 0].sum(-1).argmax(-1)
     torch.testing.assert_close(out["action"], candidates[torch.arange(2), best, 0])
     assert_in_box(out["action"], planner.action_spec)
+
+
+@pytest.mark.parametrize("engine", ["fused", "rollout"])
+def test_safe_ends_that_only_violations_reach_relax_nothing(engine):
+    planner = stub_planner(
+        constraint=classifier(ConstraintEstimator, prob=0.9), safe_set=classifier(SafeSet, prob=0.9), engine=engine
+    )
+    out = planner(latents(1))
+    assert out["plan", "safe_set_threshold"].item() == pytest.approx(0.8)
+    assert out["plan", "iterations"].item() == SMALL["optim_steps"]
+    assert out["plan", "fallback"].all()
+    assert not out["plan", "relaxed"].any()
 
 
 def test_a_fallback_prefers_fewer_violations_to_a_safer_end():
