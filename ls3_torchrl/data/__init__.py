@@ -1,6 +1,6 @@
 """The data path: episodes and their keys, tags, labels, the two-store buffer, augmentation and files."""
 
-from ls3_torchrl.data.augment import random_perspective, random_resized_crop
+from ls3_torchrl.data.augment import random_perspective
 from ls3_torchrl.data.buffer import TaggedReplayBuffer
 from ls3_torchrl.data.conform import check_datasets
 from ls3_torchrl.data.dataset import check_episodes, load_episodes, save_episodes
@@ -39,7 +39,6 @@ __all__ = [
     "length_without_idle_end",
     "load_episodes",
     "random_perspective",
-    "random_resized_crop",
     "reward_to_go",
     "save_episodes",
     "split_episodes",

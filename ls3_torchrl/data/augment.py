@@ -1,4 +1,4 @@
-"""Augmentation of the VAE's images: random resized crops, and shifts and perspectives that enlarge a dataset."""
+"""Augmentation of the VAE's images: shifts and perspectives that enlarge a dataset (section 1.3.4)."""
 
 from __future__ import annotations
 
@@ -6,71 +6,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import affine_grid, grid_sample
-
-
-def random_resized_crop(
-    pixels: Tensor, *, scale: tuple[float, float] = (0.8, 1.0), generator: torch.Generator | None = None
-) -> Tensor:
-    """Crop a random part of each image and stretch it back to full size.
-
-    Args:
-        pixels: ``[B, C, H, W]``, uint8 or floats in [0, 1].
-        scale: range of the fraction of the image's area that the crop covers, within (0, 1].
-        generator: source of randomness.
-
-    Returns:
-        float32 ``[B, C, H, W]`` in [0, 1].
-
-    Raises:
-        ValueError: for a scale outside (0, 1] or in the wrong order.
-
-    Example:
-        >>> random_resized_crop(torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).shape
-        torch.Size([2, 3, 64, 64])
-    """
-    return resized_crop(pixels, random_crops(len(pixels), scale=scale, generator=generator))
-
-
-def random_crops(
-    count: int, *, scale: tuple[float, float] = (0.8, 1.0), generator: torch.Generator | None = None
-) -> Tensor:
-    """Squares within an image whose sides reach from -1 to 1: half the side of each and its middle, ``[count, 3]``.
-
-    Args:
-        count: how many.
-        scale: range of the fraction of the image's area that a square covers, within (0, 1].
-        generator: source of randomness.
-
-    Raises:
-        ValueError: for a scale outside (0, 1] or in the wrong order.
-    """
-    low, high = scale
-    if not 0 < low <= high <= 1:
-        raise ValueError(f"scale must satisfy 0 < low <= high <= 1, got {scale}.")
-    draws = torch.rand(3, count, generator=generator)
-    side = (low + (high - low) * draws[0]).sqrt()
-    return torch.cat([side.unsqueeze(0), (1 - side) * (2 * draws[1:] - 1)]).T
-
-
-def resized_crop(pixels: Tensor, crops: Tensor) -> Tensor:
-    """The part of each image that :func:`random_crops` gives, stretched to full size.
-
-    Args:
-        pixels: ``[B, C, H, W]``, uint8 or floats in [0, 1].
-        crops: ``[B, 3]``.
-
-    Returns:
-        float32 ``[B, C, H, W]`` in [0, 1].
-    """
-    images = pixels.float() / 255.0 if pixels.dtype == torch.uint8 else pixels.float()
-    crops = crops.to(images.device)
-    theta = torch.zeros(len(images), 2, 3, device=images.device)
-    # affine_grid maps the output square [-1, 1]² to the crop: side · x + middle.
-    theta[:, 0, 0] = theta[:, 1, 1] = crops[:, 0]
-    theta[:, :, 2] = crops[:, 1:]
-    grid = affine_grid(theta, list(images.shape), align_corners=False)
-    return grid_sample(images, grid, mode="bilinear", padding_mode="border", align_corners=False)
 
 
 def random_perspective(

@@ -61,17 +61,18 @@ def _require_autocast(value: Autocast) -> None:
         raise ValueError(f"autocast must be true, false or 'auto', got {value!r}.")
 
 
-def _require_rising(value: Sequence[float] | None, name: str, meaning: str, low: float) -> tuple[float, float] | None:
-    """A pair within [0, 1] as a tuple; its first number lies above ``low`` or, for ``low`` below 0, may be 0."""
+def _warmup(value: Sequence[float] | None) -> tuple[float, float] | None:
+    """Rising fractions within [0, 1] as a tuple."""
     if value is None:
         return None
+    allowed = "warmup must be null or rising fractions of the steps [start, end]"
     if isinstance(value, str) or not isinstance(value, Sequence):
-        raise TypeError(f"{name} must be null or {meaning}, got {value!r}.")
+        raise TypeError(f"{allowed}, got {value!r}.")
     for bound in value:
-        _require_number(bound, name)
+        _require_number(bound, "warmup")
     pair = tuple(float(bound) for bound in value)
-    if len(pair) != 2 or not low < pair[0] <= pair[1] <= 1.0 or (low < 0.0 and not 0.0 <= pair[0] < pair[1]):
-        raise ValueError(f"{name} must be null or {meaning}, got {list(value)}.")
+    if len(pair) != 2 or not 0.0 <= pair[0] < pair[1] <= 1.0:
+        raise ValueError(f"{allowed}, got {list(value)}.")
     return pair
 
 
@@ -94,8 +95,6 @@ class VAEOptions:
             are trained along must predict the next latent. 0 is the paper.
         prediction_horizon: steps from the image that is predicted from to the one that is predicted, at least 1.
         unit_scale: measure the trained latents in units of their own spread.
-        crop_scale: range [low, high] within (0, 1] of the area that random resized crops of the input keep; ``None``
-            for no crops.
         enlarge_to: images of a dataset enlarged by random shifts and perspectives, from which batches seem drawn
             (section 1.3.4); ``None`` for the images as they are.
         autocast: bf16 autocast; ``"auto"`` where a short measurement finds it faster.
@@ -120,7 +119,6 @@ class VAEOptions:
     prediction_weight: float = 0.0
     prediction_horizon: int = 1
     unit_scale: bool = False
-    crop_scale: tuple[float, float] | None = (0.8, 1.0)
     enlarge_to: int | None = None
     autocast: Autocast = "auto"
 
@@ -142,10 +140,7 @@ class VAEOptions:
         _require_not_negative(self.beta, "beta")
         _require_not_negative(self.prediction_weight, "prediction_weight")
         _require_autocast(self.autocast)
-        rising = "rising fractions of the steps [start, end]"
-        object.__setattr__(self, "warmup", _require_rising(self.warmup, "warmup", rising, low=-1.0))
-        within = "[low, high] within (0, 1]"
-        object.__setattr__(self, "crop_scale", _require_rising(self.crop_scale, "crop_scale", within, low=0.0))
+        object.__setattr__(self, "warmup", _warmup(self.warmup))
 
 
 @dataclass(frozen=True)
@@ -156,13 +151,11 @@ class OfflineOptions:
         dynamics_steps: of equation (2).
         classifier_steps: of each of safe set (equation (5)), constraint and goal.
         value_steps: of equation (3), on the returns that were seen.
-        value_td_steps: of equation (4).
     """
 
     dynamics_steps: int = 10_000
     classifier_steps: int = 10_000
     value_steps: int = 10_000
-    value_td_steps: int = 10_000
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -54,9 +54,9 @@ class LS3Planner(MPCPlannerBase):
 
     Maximises E[V(z_H)] + imagined steps in the goal, subject to f_C ≤ δ_C at every imagined step and
     f_S(z_H) ≥ δ_S. A row in which no plan of a round ends in the safe set multiplies its δ_S by ``relaxation`` and
-    starts again; one in which such plans violate keeps its δ_S and refits on those that violate least. Where nothing
-    feasible was found, it acts on the plan with the fewest predicted violations and the safest end, never at random, and
-    says so under ``("plan", "fallback")``.
+    starts again; one in which all such plans violate keeps its δ_S and refits on those that violate least. Where
+    nothing feasible was found, it acts on the plan with the fewest predicted violations and the safest end, never at
+    random, and says so under ``("plan", "fallback")``.
 
     Plans for all rows of a batch at once, each with its own δ_S, warm start and reset. Use it as the policy of any
     collector or ``rollout``. An optimiser that starts from the last plan (``p_random`` below 1) needs that plan carried

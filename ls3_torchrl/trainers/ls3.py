@@ -60,7 +60,7 @@ class LS3Trainer:
         >>> buffer = TaggedReplayBuffer(capacity=100, latent_dim=4)
         >>> buffer.add(episode, "success")
         >>> buffer.encode(agent.encoder)
-        >>> options = LS3Options(offline=OfflineOptions(2, 2, 2, 2), optim=OptimOptions(batch_size=8))
+        >>> options = LS3Options(offline=OfflineOptions(2, 2, 2), optim=OptimOptions(batch_size=8))
         >>> trainer = LS3Trainer(agent, buffer, options, progress=False)
         >>> trainer.train_offline()
         >>> trainer.dynamics.steps
@@ -244,7 +244,6 @@ class LS3Trainer:
             [
                 ("dynamics", steps.dynamics_steps, "Dynamics"),
                 ("value", steps.value_steps, "Value, reward-to-go"),
-                ("value_td", steps.value_td_steps, "Value, TD-1"),
                 *self._classifiers(steps.classifier_steps),
             ]
         )

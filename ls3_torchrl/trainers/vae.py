@@ -13,7 +13,6 @@ from torchrl.record.loggers import Logger
 
 from ls3_torchrl.agent import LS3Agent
 from ls3_torchrl.data import TaggedReplayBuffer, random_perspective
-from ls3_torchrl.data.augment import random_crops
 from ls3_torchrl.exceptions import DivergenceError
 from ls3_torchrl.halves import Halves
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
@@ -21,7 +20,7 @@ from ls3_torchrl.options.training import VAEOptions
 from ls3_torchrl.trainers.checks import require_actions_of
 from ls3_torchrl.trainers.progress import progress_bar
 from ls3_torchrl.trainers.steps import LOG_INTERVAL, is_finite, log_scalars, wants_bf16
-from ls3_torchrl.trainers.vae_gradient import CROP, TARGET, VAEGradient, in_channel_order, in_memory_order, reordered
+from ls3_torchrl.trainers.vae_gradient import TARGET, VAEGradient, in_channel_order, in_memory_order, reordered
 
 _log = logging.getLogger(__name__)
 PHASE = "VAE"
@@ -226,8 +225,6 @@ class VAETrainer:
         target = self._enlarge(images)
         if target is not images:
             batch.set(TARGET, target)
-        if options.crop_scale is not None:
-            batch.set(CROP, random_crops(len(target), scale=options.crop_scale))
         return batch
 
     def _enlarge(self, pixels: Tensor) -> Tensor:

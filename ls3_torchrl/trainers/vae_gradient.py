@@ -12,15 +12,14 @@ from torch.nn import Parameter
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.modules.dropout import _DropoutNd
 
-from ls3_torchrl.data.augment import resized_crop
 from ls3_torchrl.halves import Halves
 from ls3_torchrl.modules import EnsembleDynamics, PixelDecoder, PixelEncoder
 from ls3_torchrl.modules.call import encode, is_hooked
 from ls3_torchrl.modules.vae import as_unit_pixels
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
 
-#: Where a batch holds images to reconstruct, if not the images as they are, and which part of them the encoder sees.
-TARGET, CROP = "vae_target", "vae_crop"
+#: Where a batch holds the images to encode and reconstruct, if not those that came before the action.
+TARGET = "vae_target"
 _Computed = tuple[dict[str, Tensor], tuple[Tensor | None, ...]]
 
 
@@ -100,19 +99,17 @@ class VAEGradient:
         """The losses of a part of a batch times its share in it, and the gradients of their sum."""
         images = self._in_order(batch.get(self.observation))
         target = self._in_order(batch.get(TARGET, images))
-        crops = batch.get(CROP, None)
-        given = target if crops is None else self._in_order(resized_crop(target, crops))
         with torch.autocast(noise.device.type, torch.bfloat16, enabled=self.bf16, cache_enabled=False):
             predicts = self.prediction is not None and weight
             pair: tuple[Tensor, ...] = ()
             if not predicts:
-                loc, scale = self._encode(given)
-            elif given is images:
+                loc, scale = self._encode(target)
+            elif target is images:
                 locs, scales = self._encode(torch.cat([images, self._next(batch)]))
                 pair, scale = locs.chunk(2), scales[: len(images)]
                 loc = pair[0]
             else:
-                loc, scale = self._encode(given)
+                loc, scale = self._encode(target)
                 pair = self._encode(torch.cat([images, self._next(batch)]))[0].chunk(2)
             dtype = self.loss.decoder_dtype
             found = self.loss.of_posterior(loc, scale, as_unit_pixels(target, dtype), noise=noise.to(dtype))

@@ -11,6 +11,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from ls3_recipes.options import defaults, leaves, unknown
+from ls3_recipes.renamed import REMOVED, removed
 from ls3_recipes.run_files import read_yaml
 from ls3_recipes.typed import did_you_mean
 
@@ -115,6 +116,8 @@ def _check_name(name: str, settings: type) -> None:
         where = ".".join(path[:depth])
         if not isinstance(node, Mapping):
             raise ValueError(f"{where} is one setting, not a section: {name} is none. Write {where}=VALUE.")
+        if name in REMOVED:
+            raise ValueError(removed(name))
         if key not in node:
             raise ValueError(unknown(".".join(path[depth:]), list(node), where, leaves(settings)))
         node = node[key]

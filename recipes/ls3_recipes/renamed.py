@@ -1,4 +1,4 @@
-"""Settings by their former names: still read, with a warning that gives the present one."""
+"""Former settings: by other names, still read with a warning that gives the present one, and such as are gone."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ RENAMED = {
     "task.risk.gamma": "policy.risk.gamma",
     "task.risk.threshold": "policy.risk.threshold",
 }
+
+#: Settings that are gone, and the value that is the only one now.
+REMOVED: dict[str, Any] = {"vae.crop_scale": None, "offline.value_td_steps": 0}
 
 #: Of the benchmark, whose settings have no sections.
 RENAMED_OF_BENCHMARK = {"plain": "reference"}
@@ -81,6 +84,9 @@ def rename_settings(
         renamed: present names by former ones.
         explicit: for composed settings, the present names that arguments set. All others are there by default, and
             give way to the former ones that a user's file has.
+
+    Raises:
+        ValueError: for a setting that is gone, where its value would change what is done.
     """
     out: dict[str, Any] = _copy(settings)
     for old, new in renamed.items():
@@ -101,7 +107,34 @@ def rename_settings(
         foreign = old == "task.sacfd_penalty" and out.get("algorithm") == "awac"
         if name not in target or not (explicit is None or new in explicit or foreign):
             target[name] = value
+    _drop_removed(out, trained=explicit is None)
     return out
+
+
+def _drop_removed(settings: dict[str, Any], *, trained: bool) -> None:
+    """Leave out what is gone. What a trained agent learnt with does not matter to what it does now."""
+    for old, only in REMOVED.items():
+        section, name = old.split(".")
+        values = settings.get(section)
+        if not isinstance(values, dict) or name not in values:
+            continue
+        value = values.pop(name)
+        if value == only:
+            continue
+        if not trained or section in ("agent", "planner"):
+            raise ValueError(f"{removed(old)} Got {value!r}.")
+        warnings.warn(f"This run was trained with {old} = {value!r}, a setting that is gone.", stacklevel=4)
+
+
+def removed(name: str) -> str:
+    """What is said about a setting that is gone.
+
+    Example:
+        >>> removed("vae.crop_scale")
+        'The setting vae.crop_scale is gone: all runs do now what it did at null. Leave it out.'
+    """
+    only = "null" if REMOVED[name] is None else REMOVED[name]
+    return f"The setting {name} is gone: all runs do now what it did at {only}. Leave it out."
 
 
 def _drop_empty(settings: dict[str, Any], path: Sequence[str]) -> None:

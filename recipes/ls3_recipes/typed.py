@@ -33,7 +33,7 @@ def typed(value: Any, hint: Any, name: str) -> Any:
             a list of another length.
 
     Example:
-        >>> typed(1e3, int, "vae.steps"), typed([1, 2], tuple[float, float] | None, "vae.crop_scale")
+        >>> typed(1e3, int, "vae.steps"), typed([1, 2], tuple[float, float] | None, "vae.warmup")
         (1000, (1.0, 2.0))
         >>> typed("fast", float, "vae.lr")
         Traceback (most recent call last):

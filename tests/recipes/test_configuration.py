@@ -73,7 +73,6 @@ TEXT = {
     "offline.dynamics_steps": 10_000,
     "offline.classifier_steps": 10_000,
     "vae.steps": 100_000,
-    "vae.crop_scale": [0.8, 1.0],
     "buffer.capacity": 35_000,
 }
 
@@ -277,7 +276,6 @@ def test_a_file_with_a_setting_that_nobody_has_is_refused(setting, message):
         ("vae.prediction_weight=-1.0", r"^vae\.prediction_weight"),
         ("vae.autocast=bf16", r"^vae\.autocast"),
         ("vae.reduction=median", r"^vae\.reduction"),
-        ("vae.crop_scale=[0.5,1.5]", r"^vae\.crop_scale"),
         ("vae.prediction_horizon=0", r"^vae\.prediction_horizon"),
         ("vae.checkpoint=/nowhere.pt", r"^vae\.checkpoint .*there is none at /nowhere\.pt"),
         ("optim.autocast=bf16", r"^optim\.autocast"),

@@ -1,4 +1,4 @@
-"""Former names of settings are read, with a warning that gives the present one."""
+"""Former names of settings are read, with a warning that gives the present one; what is gone is told."""
 
 import pytest
 from omegaconf import OmegaConf
@@ -6,7 +6,7 @@ from omegaconf import OmegaConf
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.configuration import settings_of_run, train_settings
 from ls3_recipes.options import as_dict, defaults
-from ls3_recipes.renamed import RENAMED, RENAMED_OF_BENCHMARK, rename_overrides, rename_settings
+from ls3_recipes.renamed import REMOVED, RENAMED, RENAMED_OF_BENCHMARK, rename_overrides, rename_settings
 
 
 def has(name):
@@ -98,3 +98,34 @@ def test_a_run_of_before_the_renaming_has_the_settings_that_it_had(tmp_path, alg
     OmegaConf.save(OmegaConf.create(old), tmp_path / "config.yaml")
     with pytest.warns(UserWarning, match="is now called"):
         assert settings_of_run(tmp_path) == settings
+
+
+@pytest.mark.parametrize("name", REMOVED)
+def test_a_setting_that_is_gone_is_none_and_arguments_that_set_it_are_told(name):
+    assert not has(name)
+    with pytest.raises(ValueError, match=rf"^The setting {name} is gone: .* Leave it out\.$"):
+        train_settings("preset=smoke", f"{name}=7")
+
+
+@pytest.mark.parametrize(("name", "only"), REMOVED.items())
+def test_a_run_that_was_trained_with_a_setting_that_is_gone_is_read(tmp_path, name, only):
+    settings = train_settings("preset=smoke")
+    section, key = name.split(".")
+    for value in (only, 7):
+        values = as_dict(settings)
+        values[section][key] = value
+        OmegaConf.save(OmegaConf.create(values), tmp_path / "config.yaml")
+        if value == only:
+            assert settings_of_run(tmp_path) == settings
+        elif section in ("agent", "planner"):  # what it does now depends on it
+            with pytest.raises(ValueError, match=f"{name} is gone"):
+                settings_of_run(tmp_path)
+        else:
+            with pytest.warns(UserWarning, match=f"trained with {name} = 7"):
+                assert settings_of_run(tmp_path) == settings
+
+
+def test_in_a_file_of_ones_own_a_setting_that_is_gone_may_only_say_what_all_runs_do():
+    assert rename_settings({"vae": {"crop_scale": None, "steps": 3}}, explicit=()) == {"vae": {"steps": 3}}
+    with pytest.raises(ValueError, match=r"vae\.crop_scale is gone.* Got \[0\.8, 1\.0\]\."):
+        rename_settings({"vae": {"crop_scale": [0.8, 1.0]}}, explicit=())

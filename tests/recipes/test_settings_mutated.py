@@ -45,7 +45,6 @@ WHOLE = {
             "offline.classifier_steps",
             "offline.dynamics_steps",
             "offline.value_steps",
-            "offline.value_td_steps",
             "online.classifier_steps",
             "online.dynamics_steps",
             "online.updates",
@@ -143,10 +142,10 @@ WORDS = {
     "vae.schedule": ("constant", "onecycle"),
 }
 SIZES = {"agent.dynamics_hidden", "agent.value_hidden", "agent.classifier_hidden", "policy.hidden"}
-PAIRS = {"vae.crop_scale", "vae.warmup"}
+PAIRS = {"vae.warmup"}
 TEXTS = {"algorithm", "preset", "device", "output"}
 PATHS = {"data", "scratch_dir", "vae.checkpoint", "output"}
-OR_NULL = {"data", "output", "scratch_dir", "vae.checkpoint", "vae.crop_scale", "vae.warmup", "loss.failure_value"}
+OR_NULL = {"data", "output", "scratch_dir", "vae.checkpoint", "vae.warmup", "loss.failure_value"}
 OR_NULL |= {"planner.constraint_threshold", "planner.safe_set_threshold", "tracker"}
 
 

@@ -13,7 +13,7 @@ from tiny_runs import ALWAYS, LS3, Run, differences, finished, is_finished
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
 
 #: Steps that are worth a process each.
-MANY = [f"offline.{name}_steps=800" for name in ("dynamics", "value", "value_td", "classifier")]
+MANY = [f"offline.{name}_steps=800" for name in ("dynamics", "value", "classifier")]
 TWO = [*(setting for setting in LS3 if not setting.startswith("threads")), "threads=2", *MANY]
 NEVER = "checkpoint_minutes=1e9"
 

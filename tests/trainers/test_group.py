@@ -64,9 +64,7 @@ def make_trainer(make_agent, episode):
         for tag, rises in {"success": {"success": 8}, "constraint": {"constraint": 5}}.items():
             buffer.add(episode(actions=torch.randn(9, 2), **rises), tag)
         buffer.encode(agent.encoder)
-        options = LS3Options(
-            OfflineOptions(steps, steps, steps, steps), OnlineOptions(steps, steps, steps), OptimOptions(16)
-        )
+        options = LS3Options(OfflineOptions(steps, steps, steps), OnlineOptions(steps, steps, steps), OptimOptions(16))
         torch.set_num_threads(threads)
         return LS3Trainer(agent, buffer, options, progress=False, **how)
 
@@ -198,7 +196,7 @@ def test_a_learner_whose_random_numbers_are_pytorchs_own_is_trained_here(make_ag
     buffer = TaggedReplayBuffer(100, latent_dim=8)
     buffer.add(episode(success=8, constraint=4), "success")
     buffer.encode(agent.encoder)
-    trainer = LS3Trainer(agent, buffer, LS3Options(OfflineOptions(3, 3, 3, 3), optim=OptimOptions(16)), progress=False)
+    trainer = LS3Trainer(agent, buffer, LS3Options(OfflineOptions(3, 3, 3), optim=OptimOptions(16)), progress=False)
     assert not trainer.value.is_independent
     assert trainer.dynamics.is_independent
     torch.set_num_threads(2)

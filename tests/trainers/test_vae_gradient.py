@@ -7,11 +7,10 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from ls3_torchrl.data.augment import random_crops, resized_crop
 from ls3_torchrl.halves import Halves
 from ls3_torchrl.modules import EnsembleDynamics, PixelDecoder, PixelEncoder
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
-from ls3_torchrl.trainers.vae_gradient import CROP, TARGET, VAEGradient, in_memory_order
+from ls3_torchrl.trainers.vae_gradient import TARGET, VAEGradient, in_memory_order
 
 D = 4
 
@@ -27,10 +26,10 @@ def images(count):
     return torch.randint(256, (count, 3, 64, 64), dtype=torch.uint8)
 
 
-def batch_of(size, *, crop=False):
+def batch_of(size, *, enlarged=False):
     rows = {"pixels": images(size), "action": torch.randn(size, 2), "next": {"pixels": images(size)}}
-    if crop:
-        rows |= {TARGET: images(size), CROP: random_crops(size, scale=(0.5, 0.9))}
+    if enlarged:
+        rows[TARGET] = images(size)
     return TensorDict(rows, [size])
 
 
@@ -57,17 +56,17 @@ def computed(gradient, batch, noise, weight, cores):
 
 
 @pytest.mark.parametrize("size", [1, 6, 7])
-@pytest.mark.parametrize("crop", [False, True])
+@pytest.mark.parametrize("enlarged", [False, True])
 @pytest.mark.parametrize("reduction", ["mean", "sum"])
-def test_halves_have_the_whole_batchs_losses_and_gradient(size, crop, reduction):
+def test_halves_have_the_whole_batchs_losses_and_gradient(size, enlarged, reduction):
     made, weight = modules(), 0.7
-    batch, noise = batch_of(size, crop=crop), torch.randn(size, D)
+    batch, noise = batch_of(size, enlarged=enlarged), torch.randn(size, D)
     gradient = gradient_of(made, reduction=reduction)
     losses, found = computed(gradient, batch, noise, weight, 2)
     # By the losses as they are called elsewhere, which encode every image by themselves.
-    seen = resized_crop(batch[TARGET], batch[CROP]) if crop else batch["pixels"]
-    loc, scale = made[0].of_pixels(seen)
-    whole = gradient.loss.of_posterior(loc, scale, batch.get(TARGET, batch["pixels"]) / 255.0, noise=noise)
+    target = batch.get(TARGET, batch["pixels"])
+    loc, scale = made[0].of_pixels(target)
+    whole = gradient.loss.of_posterior(loc, scale, target / 255.0, noise=noise)
     prediction = gradient.prediction(batch)["loss_prediction"]
     value = whole["loss_vae"] + weight * prediction
     expected = torch.autograd.grad(value, gradient.parameters)

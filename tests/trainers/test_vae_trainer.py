@@ -13,7 +13,7 @@ from ls3_torchrl.halves import Halves
 from ls3_torchrl.objectives import VAELoss
 from ls3_torchrl.trainers import DivergenceError, VAEOptions, VAETrainer
 
-FAST = {"steps": 3, "batch_size": 4, "crop_scale": None, "autocast": False}
+FAST = {"steps": 3, "batch_size": 4, "autocast": False}
 
 
 @pytest.fixture

@@ -59,7 +59,8 @@ def counts(settings: LS3Settings, horizon: int, frames: Mapping[str, float]) -> 
     passes = 2 if trained and vae.unit_scale else 1  # the frames are encoded again in the latents' own units
     out["VAE", "frame encoded"] = passes * round(sum(count * frames[kind] for kind, count in episodes.items()))
     for name, option in _LEARNERS.items():
-        out["offline", name] = getattr(settings.offline, option)
+        if hasattr(settings.offline, option):
+            out["offline", name] = getattr(settings.offline, option)
     out["planning", "world-step planned"] = out["planning", "world-step simulated"] = played * horizon
     out["planning", "frame encoded"] = played * (horizon + 1)
     for name, option in _LEARNERS.items():

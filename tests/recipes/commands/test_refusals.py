@@ -32,7 +32,7 @@ MISTAKES = {
             (*TRAIN, "agent.value_hidden=[16,big]"),
             "agent.value_hidden must be a list of whole numbers, got [16, 'big'].",
         ),
-        ((*TRAIN, "vae.crop_scale=[0.5]"), "vae.crop_scale must be a list of 2 finite numbers, or null, got [0.5]."),
+        ((*TRAIN, "vae.warmup=[0.5]"), "vae.warmup must be a list of 2 finite numbers, or null, got [0.5]."),
         ((*TRAIN, "loss.mean_latents=goal"), "loss.mean_latents must be a list of texts, got 'goal'."),
         ((*TRAIN, "output=2024"), "output must be text, or null, got 2024. Put it in quotes"),
         ((*TRAIN, "data=[a,b]"), "data must be text, or null, got ['a', 'b']."),
