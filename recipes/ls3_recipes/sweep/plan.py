@@ -6,6 +6,7 @@ import itertools
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from hashlib import blake2b
 
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
@@ -23,6 +24,8 @@ from ls3_recipes.run_settings import RunSettings
 _UNUSUAL = re.compile(r"[^\w.=,+-]+")
 #: Settings that every name has, the first by its value alone.
 _ALWAYS = ("algorithm", "task")
+#: Bytes of what is special of a run in its name; more are told by a digest.
+_LONGEST = 120
 #: Settings of a run that a sweep decides.
 _OF_THE_SWEEP = ("output", "resume")
 
@@ -149,5 +152,8 @@ def _name_of(settings: RunSettings, shown: Sequence[tuple[str, str]]) -> str:
     special = [
         f"{name.lstrip('+~').rpartition('.')[2]}={value}" for name, value in shown if name not in (*_ALWAYS, "seed")
     ]
-    parts = [settings.algorithm, settings.task.name, *special, f"seed{settings.seed}"]
-    return _UNUSUAL.sub("_", "-".join(parts))
+    begin, middle, end = f"{settings.algorithm}-{settings.task.name}", "-".join(special), f"seed{settings.seed}"
+    if len(middle.encode()) > _LONGEST:  # a whole name of more than 255 bytes is no file's
+        digest = blake2b(middle.encode(), digest_size=4).hexdigest()
+        middle = f"{middle.encode()[:_LONGEST].decode(errors='ignore')}-{digest}"
+    return _UNUSUAL.sub("_", "-".join(part for part in (begin, middle, end) if part))

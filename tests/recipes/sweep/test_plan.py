@@ -41,6 +41,19 @@ def test_no_threshold_is_a_value_like_others():
     assert names(runs)[1] == "ls3-navigation-safe_set_threshold=null-seed0"
 
 
+def test_names_of_many_settings_fit_a_file_system_and_stay_apart():
+    many = [f"planner.{name}" for name in ("pessimism=2.0", "noise_scale=0.5", "constraint_reduction=mean")]
+    many += ["loss.failure_weight=0.25", "loss.timed_out_weight=0.5", "agent.initial_value=-12.5", "optim.cooldown=0.1"]
+    arms = [[*many, f"loss.gamma_safe_set={gamma}"] for gamma in (0.5, 0.6)]
+    one, other = names(planned_runs(arms, [], ["preset=smoke"]))
+    assert one != other
+    for name in (one, other):
+        assert name.startswith("ls3-navigation-pessimism=2.0-noise_scale=0.5-")
+        assert name.endswith("-seed0")
+        assert len(name.encode()) < 180
+    assert one == names(planned_runs(arms[:1], [], ["preset=smoke"]))[0]
+
+
 def test_what_no_run_can_have_is_refused_before_any_begins():
     with pytest.raises(ValueError, match=r"planner\.horizon must not|planner\.horizon must be at least 1"):
         planned_runs([[]], ["seed=0,1"], ["planner.horizon=3,0"])
