@@ -251,6 +251,33 @@ def test_a_file_of_version_one_is_read_with_a_warning(tmp_path):
     assert torch.equal(outputs(loaded)["loc"], outputs(agent)["loc"])
 
 
+GONE = {"planner": {"common_noise": True, "min_std": 0.0}}
+
+
+def written_before(tmp_path, **other):
+    """An agent that plans from images, and its file as it was written when there were more settings."""
+    agent = tiny()
+    agent.planner(SPEC, **OPTIONS)
+    path = agent.save(tmp_path / "agent.pt")
+    content = torch.load(path, weights_only=True)
+    change(path, **{group: content[group] | gone | other.get(group, {}) for group, gone in GONE.items()})
+    return agent, path
+
+
+def test_a_file_with_settings_that_are_gone_is_read_where_they_are_what_all_agents_have_now(tmp_path):
+    agent, path = written_before(tmp_path)
+    loaded = LS3Agent.load(path)
+    assert (loaded.architecture, loaded.planner_settings) == (agent.architecture, agent.planner_settings)
+    assert torch.equal(acts(loaded.planner()), acts(agent.planner()))
+
+
+@pytest.mark.parametrize(("group", "name", "value"), [("planner", "common_noise", False), ("planner", "min_std", 0.05)])
+def test_a_file_that_a_setting_which_is_gone_made_another_agent_is_refused(tmp_path, group, name, value):
+    _, path = written_before(tmp_path, **{group: {name: value}})
+    with pytest.raises(ValueError, match=rf"holds an agent with {name}={value!r}\. That setting is gone.* Train again"):
+        LS3Agent.load(path)
+
+
 @pytest.mark.parametrize(
     "numbers",
     [

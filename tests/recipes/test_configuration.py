@@ -64,7 +64,6 @@ TEXT = {
     "planner.relaxation": 0.8,
     "planner.optim_steps": 4,  # n_cem_iters = 5 samples five iterations and scores four
     "planner.pessimism": 0.0,
-    "planner.min_std": 0.0,
     "online.updates": 25,
     "online.episodes_per_update": 10,
     "online.value_td_steps": 2000,

@@ -97,7 +97,6 @@ NUMBERS = {
         [
             "loss.failure_weight",
             "loss.timed_out_weight",
-            "planner.min_std",
             "planner.noise_scale",
             "planner.pessimism",
             "policy.updates_per_step",
@@ -118,7 +117,6 @@ FLAGS = {
     "loss.zero_at_goal",
     "optim.bootstrap",
     "pictures",
-    "planner.common_noise",
     "policy.learn_alpha",
     "policy.zero_at_goal",
     "recovery",
