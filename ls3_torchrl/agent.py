@@ -35,7 +35,10 @@ VERSION = 2
 PARTS = ("encoder", "decoder", "dynamics", "value", "safe_set", "constraint", "goal")
 _PACKAGES = ("ls3-torchrl", "torch", "torchrl", "tensordict")
 #: Settings that are gone, in files of before, and the value that is the only one now.
-_REMOVED: dict[str, dict[str, Any]] = {"planner": {"common_noise": True, "min_std": 0.0}}
+_REMOVED: dict[str, dict[str, Any]] = {
+    "architecture": {"propagation": "ts1"},
+    "planner": {"common_noise": True, "min_std": 0.0},
+}
 
 
 def _storable(name: str, value: Any) -> Any:
@@ -160,7 +163,6 @@ class LS3Agent(nn.Module):
             shape.action_dim,
             num_members=shape.num_dynamics,
             hidden=shape.dynamics_hidden,
-            propagation=shape.propagation,
             control_affine=shape.control_affine,
             action_scale=shape.action_scale,
         )

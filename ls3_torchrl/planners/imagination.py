@@ -84,7 +84,7 @@ class Imagination(Protocol):
 def sample_imagination_noise(
     env: LatentEnv, rows: int, horizon: int, particles: int, *, device: torch.device | None = None
 ) -> ImaginationNoise:
-    """Members and noise for ``rows`` plans: an even split of the particles, anew at each step or once under TS-∞.
+    """Members and noise for ``rows`` plans: an even split of the particles, anew at each step (TS-1).
 
     Args:
         env: the learned model; dynamics that are no ensemble have one member.
@@ -99,9 +99,8 @@ def sample_imagination_noise(
             return env.dynamics.sample_members(particles, device=device)
         return torch.zeros(particles, dtype=torch.long, device=device)
 
-    over_time = members().expand(horizon, -1) if env.fixed_members else torch.stack([members() for _ in range(horizon)])
-    noise = torch.randn(rows, horizon, particles, env.latent_dim, device=device)
-    return ImaginationNoise(over_time, noise)
+    over_time = torch.stack([members() for _ in range(horizon)])
+    return ImaginationNoise(over_time, torch.randn(rows, horizon, particles, env.latent_dim, device=device))
 
 
 class RolloutImagination:
@@ -174,20 +173,15 @@ class RolloutImagination:
         member_key, noise_key = (getattr(env.dynamics, name, None) for name in ("member_key", "noise_key"))
         clock = iter(range(horizon))
 
-        def members_at(t: int) -> Tensor:
-            return noise.members[t].reshape(1, 1, p, 1).expand(b, n, p, 1)
-
         def follow_the_plan(tensordict: TensorDictBase) -> TensorDictBase:
             t = next(clock)
             if member_key is not None:
-                tensordict.set(member_key, members_at(t))
+                tensordict.set(member_key, noise.members[t].reshape(1, 1, p, 1).expand(b, n, p, 1))
             if noise_key is not None:
                 tensordict.set(noise_key, noise.noise[:, t].unsqueeze(1).expand(b, n, p, d).to(dtype))
             return tensordict.set(env.action_key, actions[:, :, t].unsqueeze(2).expand(b, n, p, -1))
 
         first = TensorDict({}, [b, n, p])
         first.set(env.latent_key, latent[:, None, None].expand(b, n, p, d).to(dtype))
-        if env.fixed_members:
-            first.set(member_key, members_at(0))
         start = env.reset(first)
         return env.rollout(horizon, follow_the_plan, auto_reset=False, tensordict=start, return_contiguous=True)

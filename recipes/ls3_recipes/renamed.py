@@ -29,6 +29,7 @@ RENAMED = {
 REMOVED: dict[str, Any] = {
     "vae.crop_scale": None,
     "offline.value_td_steps": 0,
+    "agent.propagation": "ts1",
     "planner.common_noise": True,
     "planner.min_std": 0.0,
 }

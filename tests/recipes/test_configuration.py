@@ -56,7 +56,6 @@ TEXT = {
     "agent.dynamics_hidden": [128, 128],
     "agent.value_hidden": [256, 256, 256],
     "agent.classifier_hidden": [256, 256, 256],
-    "agent.propagation": "ts1",
     "optim.lr": 1e-4,
     "vae.lr": 1e-4,
     "optim.dynamics_lr": 1e-3,

@@ -123,7 +123,6 @@ FLAGS = {
     "vae.unit_scale",
 }
 WORDS = {
-    "agent.propagation": ("ts1", "tsinf"),
     "encoder": ("latents", "conv"),
     "loss.failure_rows": ("all", "violating"),
     "online.select": ("last", "best"),
