@@ -29,6 +29,8 @@ RENAMED = {
 REMOVED: dict[str, Any] = {
     "vae.crop_scale": None,
     "offline.value_td_steps": 0,
+    "vae.reduction": "mean",
+    "optim.bootstrap": True,
     "agent.propagation": "ts1",
     "planner.common_noise": True,
     "planner.min_std": 0.0,

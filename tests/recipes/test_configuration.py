@@ -273,7 +273,6 @@ def test_a_file_with_a_setting_that_nobody_has_is_refused(setting, message):
         ("vae.warmup=[0.5,1.5]", r"^vae\.warmup"),
         ("vae.prediction_weight=-1.0", r"^vae\.prediction_weight"),
         ("vae.autocast=bf16", r"^vae\.autocast"),
-        ("vae.reduction=median", r"^vae\.reduction"),
         ("vae.prediction_horizon=0", r"^vae\.prediction_horizon"),
         ("vae.checkpoint=/nowhere.pt", r"^vae\.checkpoint .*there is none at /nowhere\.pt"),
         ("optim.autocast=bf16", r"^optim\.autocast"),

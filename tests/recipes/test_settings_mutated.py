@@ -115,7 +115,6 @@ FLAGS = {
     "buffer.dynamics_after_violation",
     "loss.monte_carlo",
     "loss.zero_at_goal",
-    "optim.bootstrap",
     "pictures",
     "policy.learn_alpha",
     "policy.zero_at_goal",
@@ -135,7 +134,6 @@ WORDS = {
     "tracker": ("wandb",),
     "task.name": ("navigation", "reacher", "pushing", "cable_routing"),
     "vae.autocast": (True, False, "auto"),
-    "vae.reduction": ("mean", "sum"),
     "vae.schedule": ("constant", "onecycle"),
 }
 SIZES = {"agent.dynamics_hidden", "agent.value_hidden", "agent.classifier_hidden", "policy.hidden"}
