@@ -4,6 +4,7 @@ import copy
 import functools
 import math
 import re
+import sys
 
 import pytest
 from hypothesis import example, given, settings
@@ -150,7 +151,7 @@ def is_whole(value, low):
 
 
 def is_number(value, low=-INF, high=INF, opening="(", closing=")"):
-    if type(value) not in (int, float) or abs(value) > 1.7e308 or not math.isfinite(value):
+    if type(value) not in (int, float) or abs(value) > sys.float_info.max or not math.isfinite(value):
         return False
     return (low < value or (opening == "[" and value == low)) and (value < high or (closing == "]" and value == high))
 
