@@ -34,6 +34,8 @@ REMOVED: dict[str, Any] = {
     "agent.propagation": "ts1",
     "planner.common_noise": True,
     "planner.min_std": 0.0,
+    "policy.learn_alpha": False,
+    "policy.zero_at_goal": False,
 }
 
 #: Of the benchmark, whose settings have no sections.

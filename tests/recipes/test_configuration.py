@@ -165,12 +165,7 @@ def test_every_domain_has_a_file_of_settings_and_every_file_a_domain():
 def test_the_preset_paper_keeps_the_defaults_of_the_implementations_that_the_paper_cites():
     sac = train_settings("algorithm=sacfd", "preset=paper")
     assert sac.encoder == "conv"
-    assert (sac.policy.alpha, sac.policy.learn_alpha, sac.policy.tau, sac.policy.updates_per_step) == (
-        0.2,
-        False,
-        0.005,
-        1,
-    )
+    assert (sac.policy.alpha, sac.policy.tau, sac.policy.updates_per_step) == (0.2, 0.005, 1)
     assert (sac.policy.batch_size, sac.policy.hidden, sac.policy.lr) == (256, (256, 256), 3e-4)
     awac = train_settings("algorithm=awac", "preset=paper").policy
     assert (awac.batch_size, awac.temperature, awac.tau, awac.updates_per_step, awac.lr) == (1024, 2.0, 0.005, 1, 3e-4)

@@ -117,8 +117,6 @@ FLAGS = {
     "loss.monte_carlo",
     "loss.zero_at_goal",
     "pictures",
-    "policy.learn_alpha",
-    "policy.zero_at_goal",
     "recovery",
     "vae.unit_scale",
 }
