@@ -34,6 +34,11 @@ VERSION = 2
 #: The modules of an agent that can be given from outside, in the order of the paper.
 PARTS = ("encoder", "decoder", "dynamics", "value", "safe_set", "constraint", "goal")
 _PACKAGES = ("ls3-torchrl", "torch", "torchrl", "tensordict")
+#: Settings that are gone, in files of before, and the value that is the only one now.
+_REMOVED: dict[str, dict[str, Any]] = {
+    "architecture": {"propagation": "ts1"},
+    "planner": {"common_noise": True, "min_std": 0.0},
+}
 
 
 def _storable(name: str, value: Any) -> Any:
@@ -158,7 +163,6 @@ class LS3Agent(nn.Module):
             shape.action_dim,
             num_members=shape.num_dynamics,
             hidden=shape.dynamics_hidden,
-            propagation=shape.propagation,
             control_affine=shape.control_affine,
             action_scale=shape.action_scale,
         )
@@ -333,7 +337,23 @@ def _read(path: Path) -> dict[str, Any]:
             raise ValueError(
                 f"{path} is an agent file without {name}, or is damaged. Pass a file written by LS3Agent.save()."
             )
+    _drop_removed(path, content)
     return content
+
+
+def _drop_removed(path: Path, content: dict[str, Any]) -> None:
+    """Leave out what is gone; refuse an agent that it made another one."""
+    for group, removed in _REMOVED.items():
+        values = content.get(group)
+        if not isinstance(values, dict):
+            continue
+        for name, only in removed.items():
+            value = values.pop(name, only)
+            if value != only:
+                raise ValueError(
+                    f"{path} holds an agent with {name}={value!r}. That setting is gone: all agents are now what they "
+                    f"were at {only!r}. Train again, or install the library version that wrote it."
+                )
 
 
 def _require_finite(weights: Mapping[str, Any], where: str) -> None:

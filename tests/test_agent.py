@@ -51,7 +51,6 @@ def test_default_sizes_are_the_papers():
     for head in (agent.safe_set, agent.constraint, agent.goal):
         shapes = [tuple(p.shape) for p in head.parameters() if p.ndim == 2]
         assert shapes == [(256, 32), (256, 256), (256, 256), (1, 256)]
-    assert agent.dynamics.propagation == "ts1"
 
 
 def test_a_round_trip_gives_identical_outputs(tmp_path):
@@ -67,10 +66,6 @@ def test_a_round_trip_gives_identical_outputs(tmp_path):
     assert not torch.equal(one["loc"], outputs(tiny(seed=1))["loc"])
     # No half-written file stays behind.
     assert [file.name for file in path.parent.iterdir()] == ["agent.pt"]
-
-
-def test_propagation_travels_with_the_file(tmp_path):
-    assert LS3Agent.load(tiny(propagation="tsinf").save(tmp_path / "a.pt")).dynamics.propagation == "tsinf"
 
 
 def test_the_form_of_the_dynamics_travels_with_the_file(tmp_path):
@@ -155,11 +150,6 @@ def test_a_missing_file_is_named(tmp_path):
 def test_sizes_below_one_are_refused(size):
     with pytest.raises(ValueError, match="must be at least 1, got 0"):
         LS3Agent(**({"action_dim": 2} | TINY | {size: 0}))
-
-
-def test_unknown_propagation_is_refused():
-    with pytest.raises(ValueError, match="propagation must be one of 'ts1', 'tsinf'"):
-        tiny(propagation="ts2")
 
 
 OPTIONS = {"num_candidates": 20, "num_elites": 4, "num_particles": 2, "optim_steps": 1, "horizon": 2}
@@ -249,6 +239,36 @@ def test_a_file_of_version_one_is_read_with_a_warning(tmp_path):
     with pytest.warns(UserWarning, match="version 1, which keeps neither bounds nor planner settings"):
         loaded = LS3Agent.load(path)
     assert torch.equal(outputs(loaded)["loc"], outputs(agent)["loc"])
+
+
+GONE = {"architecture": {"propagation": "ts1"}, "planner": {"common_noise": True, "min_std": 0.0}}
+
+
+def written_before(tmp_path, **other):
+    """An agent that plans from images, and its file as it was written when there were more settings."""
+    agent = tiny()
+    agent.planner(SPEC, **OPTIONS)
+    path = agent.save(tmp_path / "agent.pt")
+    content = torch.load(path, weights_only=True)
+    change(path, **{group: content[group] | gone | other.get(group, {}) for group, gone in GONE.items()})
+    return agent, path
+
+
+def test_a_file_with_settings_that_are_gone_is_read_where_they_are_what_all_agents_have_now(tmp_path):
+    agent, path = written_before(tmp_path)
+    loaded = LS3Agent.load(path)
+    assert (loaded.architecture, loaded.planner_settings) == (agent.architecture, agent.planner_settings)
+    assert torch.equal(acts(loaded.planner()), acts(agent.planner()))
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "value"),
+    [("architecture", "propagation", "tsinf"), ("planner", "common_noise", False), ("planner", "min_std", 0.05)],
+)
+def test_a_file_that_a_setting_which_is_gone_made_another_agent_is_refused(tmp_path, group, name, value):
+    _, path = written_before(tmp_path, **{group: {name: value}})
+    with pytest.raises(ValueError, match=rf"holds an agent with {name}={value!r}\. That setting is gone.* Train again"):
+        LS3Agent.load(path)
 
 
 @pytest.mark.parametrize(

@@ -3,40 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from ls3_torchrl._checks import require_choice, require_keys, require_size
+from ls3_torchrl._checks import require_keys, require_size
 from ls3_torchrl.modules.ensemble import EnsembleMLP
-
-Propagation = Literal["ts1", "tsinf"]
 
 
 class EnsembleDynamics(TensorDictModuleBase):
     """M networks, each a Gaussian over the next latent: N(z + Δ_m(z, a), σ_m(z, a)²).
 
     Two hidden layers of 128 (section 1.1.1). ``forward`` imagines one step: every row, a particle, is moved by one
-    member and its noise. Members and noise that are already in the tensordict are used as they are, which makes
-    rollouts repeatable.
+    member, sampled anew at every step (TS-1, the paper's choice), and its noise. Members and noise that are already in
+    the tensordict are used as they are, which makes rollouts repeatable.
 
     The mean change Δ_m and the standard deviation σ_m come from one network of latent and action together, which is the
     paper's choice. With ``control_affine`` the network sees the latent alone, and Δ_m(z, a) = b_m(z) + A_m(z) a with
     σ_m(z). Most mechanics have this form, and few demonstrations then tell what actions do that they hardly contain.
-
-    ``propagation`` says which member moves a particle from step to step: with ``"ts1"`` (TS-1, the paper's choice) one
-    that is sampled at every step, with ``"tsinf"`` (TS-∞) the one that was sampled first, which travels under
-    ``member_key``.
 
     Args:
         latent_dim: D.
         action_dim: A.
         num_members: M.
         hidden: sizes of the hidden layers.
-        propagation: ``"ts1"`` or ``"tsinf"``.
         control_affine: the change of the latent is affine in the action.
         action_scale: unit of the actions, one number or one for each of A; the networks see a / ``action_scale``. Half
             the action's range is a good one: a displacement of centimetres in metres is all but invisible to them.
@@ -45,12 +38,12 @@ class EnsembleDynamics(TensorDictModuleBase):
         latent_key: latent ``[*B, D]``.
         action_key: action ``[*B, A]``, in the environment's units.
         next_latent_key: where the imagined next latent ``[*B, D]`` is written.
-        member_key: member of each row, int64 ``[*B, 1]`` in 0…M−1; sampled when absent, written for ``"tsinf"``.
+        member_key: member of each row, int64 ``[*B, 1]`` in 0…M−1; sampled when absent.
         noise_key: standard normal noise ``[*B, D]``; sampled when absent.
 
     Raises:
-        ValueError: for an unknown propagation, an ``action_scale`` that is not positive or not of size A, or latents
-            and actions of another size.
+        ValueError: for an ``action_scale`` that is not positive or not of size A, or latents and actions of another
+            size.
         KeyError: when latent or action is missing.
 
     Source: Chua et al., "Deep Reinforcement Learning in a Handful of Trials", section 5 and appendix.
@@ -71,7 +64,6 @@ class EnsembleDynamics(TensorDictModuleBase):
         *,
         num_members: int = 5,
         hidden: Sequence[int] = (128, 128),
-        propagation: Propagation = "ts1",
         control_affine: bool = False,
         action_scale: float | Sequence[float] = 1.0,
         log_scale_bounds: tuple[float, float] = (-8.0, 4.0),
@@ -82,12 +74,10 @@ class EnsembleDynamics(TensorDictModuleBase):
         noise_key: NestedKey = "dynamics_noise",
     ) -> None:
         super().__init__()
-        require_choice(propagation, ("ts1", "tsinf"), "propagation")
         low, high = log_scale_bounds
         if not low < high:
             raise ValueError(f"log_scale_bounds must rise, got {log_scale_bounds}.")
         self.latent_dim, self.action_dim, self.num_members = latent_dim, action_dim, num_members
-        self.propagation: Propagation = propagation
         self.control_affine = control_affine
         self.log_scale_bounds = (float(low), float(high))
         scale = torch.as_tensor(action_scale, dtype=torch.float32)
@@ -179,8 +169,6 @@ class EnsembleDynamics(TensorDictModuleBase):
         if members is None:
             members = self.sample_members(latent[..., 0].numel(), device=latent.device)
             members = members.reshape(*latent.shape[:-1], 1)
-            if self.propagation == "tsinf":
-                tensordict.set(self.member_key, members)
         noise = tensordict.get(self.noise_key, None)
         if noise is None:
             noise = torch.randn_like(latent)

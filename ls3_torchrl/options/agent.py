@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
-from ls3_torchrl._values import require_at_least, require_choice
+from ls3_torchrl._values import require_at_least
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,6 @@ class AgentArchitecture:
         value_hidden: hidden layers of V.
         classifier_hidden: hidden layers of f_S, f_C and f_G.
         initial_value: where the value networks' output biases start.
-        propagation: ``"ts1"`` or ``"tsinf"``; see :class:`~ls3_torchrl.modules.EnsembleDynamics`.
         control_affine: the dynamics' change of the latent is affine in the action.
         action_scale: unit of the actions in the dynamics, one number or one for each of A. :class:`LS3Agent` also takes
             ``"box"``, half the range of the actions.
@@ -43,7 +42,6 @@ class AgentArchitecture:
     value_hidden: tuple[int, ...] = (256, 256, 256)
     classifier_hidden: tuple[int, ...] = (256, 256, 256)
     initial_value: float = 0.0
-    propagation: Literal["ts1", "tsinf"] = "ts1"
     control_affine: bool = False
     action_scale: float | tuple[float, ...] = 1.0
     background: bool = False
@@ -56,7 +54,6 @@ class AgentArchitecture:
             require_at_least(getattr(self, name), 1, name)
         for name in ("dynamics_hidden", "value_hidden", "classifier_hidden"):
             object.__setattr__(self, name, tuple(require_at_least(size, 1, name) for size in getattr(self, name)))
-        require_choice(self.propagation, ("ts1", "tsinf"), "propagation")
 
 
 def plain_of(value: Any) -> Any:

@@ -36,7 +36,6 @@ class ControlOptions:
     safe_set_reduction: SafeSetReduction = "mean"
     goal_reduction: GoalReduction = "count"
     pessimism: float = 0.0
-    common_noise: bool = True
     noise_scale: float = 1.0
     engine: EngineName = "auto"
     precision: Precision = "auto"
@@ -75,7 +74,6 @@ class CEMOptions:
     optim_steps: int = 4
     p_random: float = 1.0
     p_constant: float = 0.0
-    min_std: float = 0.0
 
     def __post_init__(self) -> None:
         require_at_least(self.num_candidates, 1, "num_candidates")
@@ -90,7 +88,6 @@ class CEMOptions:
                 f"p_constant must lie in [0, 1] and leave room for p_random, got p_constant={self.p_constant} and "
                 f"p_random={self.p_random}: together they must not exceed 1."
             )
-        require_not_negative(self.min_std, "min_std")
         require_at_least(self.optim_steps, 1, "optim_steps")
 
 

@@ -89,8 +89,6 @@ class VAEOptions:
         beta: β, at least 0 (Table 1: 1e-6).
         warmup: fractions [start, end] of the steps between which β and ``prediction_weight`` rise from 0; ``None``
             for none. With few latents and a large β a small moving object is otherwise never drawn.
-        reduction: ``"mean"`` or ``"sum"`` over pixels and latent dimensions; see
-            :class:`~ls3_torchrl.objectives.VAELoss`.
         prediction_weight: weight, at least 0, of :class:`~ls3_torchrl.objectives.LatentPredictionLoss`: dynamics that
             are trained along must predict the next latent. 0 is the paper.
         prediction_horizon: steps from the image that is predicted from to the one that is predicted, at least 1.
@@ -115,7 +113,6 @@ class VAEOptions:
     schedule: Literal["constant", "onecycle"] = "constant"
     beta: float = 1e-6
     warmup: tuple[float, float] | None = None
-    reduction: Literal["mean", "sum"] = "mean"
     prediction_weight: float = 0.0
     prediction_horizon: int = 1
     unit_scale: bool = False
@@ -136,7 +133,6 @@ class VAEOptions:
         _require_above_zero(self.lr, "lr")
         _require_flags(self, "unit_scale")
         require_choice(self.schedule, ("constant", "onecycle"), "schedule")
-        require_choice(self.reduction, ("mean", "sum"), "reduction")
         _require_not_negative(self.beta, "beta")
         _require_not_negative(self.prediction_weight, "prediction_weight")
         _require_autocast(self.autocast)
@@ -189,7 +185,7 @@ class OnlineOptions:
 
 @dataclass(frozen=True)
 class OptimOptions:
-    """How the latent models are optimised, all with Adam (section 1.2).
+    """How the latent models are optimised, all with Adam (section 1.2), ensembles with a batch for each member.
 
     Args:
         batch_size: transitions in a step, at least 1 (Table 1: 256).
@@ -198,7 +194,6 @@ class OptimOptions:
         target_interval: gradient steps between copies to the lagged networks of equations (4) and (5), at least 1.
         autocast: bf16 autocast; ``"auto"`` where a short measurement finds it faster.
         cooldown: fraction of every phase's steps, at its end, over which the learning rate falls linearly to 0.
-        bootstrap: a batch of its own for each member of an ensemble, as in Chua et al.; otherwise all see the same.
     """
 
     batch_size: int = 256
@@ -207,7 +202,6 @@ class OptimOptions:
     target_interval: int = 100
     autocast: Autocast = "auto"
     cooldown: float = 0.0
-    bootstrap: bool = True
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "target_interval"):
@@ -216,7 +210,6 @@ class OptimOptions:
             _require_above_zero(getattr(self, name), name)
         _require_autocast(self.autocast)
         _require_fraction(self.cooldown, "cooldown")
-        _require_flags(self, "bootstrap")
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,6 @@ class CrossEntropyMethod:
         p_constant: fraction of candidates in the first round that hold one uniform action over the whole horizon.
             Actions drawn independently step by step mostly cancel; a way that has to be kept up is found among
             correlated ones (as in Pinneri et al. 2020, arXiv 2008.06389). 0 is the paper.
-        min_std: floor of the refitted standard deviation as a fraction of the box's side; 0 is the paper.
 
     Raises:
         ValueError: for settings out of range.
@@ -107,7 +106,6 @@ class CrossEntropyMethod:
         optim_steps: int = 4,
         p_random: float = 1.0,
         p_constant: float = 0.0,
-        min_std: float = 0.0,
     ) -> None:
         CEMOptions(
             num_candidates=num_candidates,
@@ -115,14 +113,12 @@ class CrossEntropyMethod:
             optim_steps=optim_steps,
             p_random=p_random,
             p_constant=p_constant,
-            min_std=min_std,
         )
         self.num_candidates = num_candidates
         self.num_elites = num_elites
         self.optim_steps = optim_steps
         self.p_random = p_random
         self.p_constant = p_constant
-        self.min_std = min_std
 
     @property
     def num_random(self) -> int:
@@ -177,7 +173,7 @@ class CrossEntropyMethod:
             search.iterations[rows] += 1
             elites = self._select(actions, scores)
             self._keep_best(search, rows, elites)
-            self._refit(search, rows, elites, self.min_std * (high - low))
+            self._refit(search, rows, elites)
             self._restart(search, rows[elites.restart], max_restarts)
             rows = rows[search.step[rows] < self.optim_steps]
             iteration += 1
@@ -218,7 +214,7 @@ class CrossEntropyMethod:
         search.best_score[rows[better]] = elites.score[better, 0]
         search.found[rows[elites.feasible]] = True
 
-    def _refit(self, search: _Search, rows: Tensor, elites: _Elites, min_std: Tensor) -> None:
+    def _refit(self, search: _Search, rows: Tensor, elites: _Elites) -> None:
         """Rows that do not start again: their Gaussian is refitted on the elites."""
         going_on = ~elites.restart
         search.step[rows[going_on]] += 1
@@ -229,7 +225,7 @@ class CrossEntropyMethod:
         std = (weight * (elites.actions - mean[:, None]).square()).sum(1).sqrt()
         refitted = going_on & ranked.any(-1)
         search.mean[rows[refitted]] = mean[refitted]
-        search.std[rows[refitted]] = torch.maximum(std[refitted], min_std)
+        search.std[rows[refitted]] = std[refitted]
 
     def _restart(self, search: _Search, rows: Tensor, max_restarts: int) -> None:
         """These rows start again, or are done when they have done so ``max_restarts`` times."""

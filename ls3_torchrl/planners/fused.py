@@ -186,7 +186,7 @@ class FusedImagination:
             # Rows of the batch lie one after another: a part may hold plans of several.
             rows, row_of = _rows_of(part, n, latent.device)
             start, plan = latent[rows], steps[:, part].contiguous()
-            drawn = None if still else _noise_of(noise.noise, rows, row_of, part)
+            drawn = None if still else _noise_of(noise.noise[rows], row_of)
             own = None if limits is None else limits._replace(safe_set_threshold=limits.safe_set_threshold[rows])
             if own is not None and row_of is not None:
                 own = own._replace(safe_set_threshold=own.safe_set_threshold[row_of])
@@ -334,9 +334,6 @@ def _rows_of(part: slice, candidates: int, device: torch.device) -> tuple[slice,
     return slice(first, last + 1), torch.arange(part.start, part.stop, device=device) // candidates - first
 
 
-def _noise_of(noise: Tensor, rows: slice, row_of: Tensor | None, part: slice) -> Tensor:
-    """Noise ``[H, P, R or 1, D]`` of a part's plans."""
-    if noise.shape[3] > 1:
-        first = part.start - rows.start * noise.shape[3]
-        return noise[rows].permute(1, 2, 0, 3, 4).flatten(2, 3)[:, :, first : first + part.stop - part.start]
-    return noise[rows.start] if row_of is None else noise[rows][row_of, :, :, 0].permute(1, 2, 0, 3)
+def _noise_of(noise: Tensor, row_of: Tensor | None) -> Tensor:
+    """Noise ``[H, P, R or 1, D]`` of a part's plans, which lie in rows with the noise ``[k, H, P, D]``."""
+    return (noise if row_of is None else noise[row_of]).permute(1, 2, 0, 3)

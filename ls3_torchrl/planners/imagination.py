@@ -23,7 +23,7 @@ class ImaginationNoise(NamedTuple):
     Attributes:
         members: member that moves particle p at step h, int64 ``[H, P]``; the same for all plans, which
             compares them under common random numbers.
-        noise: standard normal ``[b, H, P, N or 1, D]``; with 1, common to a row's N candidates.
+        noise: standard normal ``[b, H, P, D]``, likewise common to a row's candidates.
     """
 
     members: Tensor
@@ -37,7 +37,7 @@ class PlanNoise(NamedTuple):
         candidates: the optimiser's noise, each ``[K, B, ...]``; of the cross-entropy method standard normal and
             uniform in [0, 1), ``[K, B, N, H, A]`` each.
         members: dynamics members ``[K, H, P]``.
-        dynamics: dynamics noise ``[K, B, H, P, N or 1, D]``.
+        dynamics: dynamics noise ``[K, B, H, P, D]``.
     """
 
     candidates: tuple[Tensor, ...]
@@ -82,16 +82,15 @@ class Imagination(Protocol):
 
 
 def sample_imagination_noise(
-    env: LatentEnv, rows: int, horizon: int, particles: int, candidates: int, *, device: torch.device | None = None
+    env: LatentEnv, rows: int, horizon: int, particles: int, *, device: torch.device | None = None
 ) -> ImaginationNoise:
-    """Members and noise for ``rows`` plans: an even split of the particles, anew at each step or once under TS-∞.
+    """Members and noise for ``rows`` plans: an even split of the particles, anew at each step (TS-1).
 
     Args:
         env: the learned model; dynamics that are no ensemble have one member.
         rows: b.
         horizon: H.
         particles: P.
-        candidates: N for noise of each candidate's own; 1 for noise that a row's candidates share.
         device: where to draw.
     """
 
@@ -100,9 +99,8 @@ def sample_imagination_noise(
             return env.dynamics.sample_members(particles, device=device)
         return torch.zeros(particles, dtype=torch.long, device=device)
 
-    over_time = members().expand(horizon, -1) if env.fixed_members else torch.stack([members() for _ in range(horizon)])
-    noise = torch.randn(rows, horizon, particles, candidates, env.latent_dim, device=device)
-    return ImaginationNoise(over_time, noise)
+    over_time = torch.stack([members() for _ in range(horizon)])
+    return ImaginationNoise(over_time, torch.randn(rows, horizon, particles, env.latent_dim, device=device))
 
 
 class RolloutImagination:
@@ -124,7 +122,7 @@ class RolloutImagination:
         >>> spec = Bounded(low=-1.0, high=1.0, shape=(2,))
         >>> env = LatentEnv(EnsembleDynamics(8, 2), ConstraintEstimator(8), GoalEstimator(8), action_spec=spec)
         >>> imagine = RolloutImagination(env, ValueEnsemble(8), SafeSet(8))
-        >>> noise = ImaginationNoise(torch.zeros(3, 4, dtype=torch.long), torch.zeros(1, 3, 4, 1, 8))
+        >>> noise = ImaginationNoise(torch.zeros(3, 4, dtype=torch.long), torch.zeros(1, 3, 4, 8))
         >>> imagine(torch.zeros(1, 8), torch.zeros(1, 6, 3, 2), noise).safe_set_prob.shape
         torch.Size([1, 6])
     """
@@ -175,20 +173,15 @@ class RolloutImagination:
         member_key, noise_key = (getattr(env.dynamics, name, None) for name in ("member_key", "noise_key"))
         clock = iter(range(horizon))
 
-        def members_at(t: int) -> Tensor:
-            return noise.members[t].reshape(1, 1, p, 1).expand(b, n, p, 1)
-
         def follow_the_plan(tensordict: TensorDictBase) -> TensorDictBase:
             t = next(clock)
             if member_key is not None:
-                tensordict.set(member_key, members_at(t))
+                tensordict.set(member_key, noise.members[t].reshape(1, 1, p, 1).expand(b, n, p, 1))
             if noise_key is not None:
-                tensordict.set(noise_key, noise.noise[:, t].transpose(1, 2).expand(b, n, p, d).to(dtype))
+                tensordict.set(noise_key, noise.noise[:, t].unsqueeze(1).expand(b, n, p, d).to(dtype))
             return tensordict.set(env.action_key, actions[:, :, t].unsqueeze(2).expand(b, n, p, -1))
 
         first = TensorDict({}, [b, n, p])
         first.set(env.latent_key, latent[:, None, None].expand(b, n, p, d).to(dtype))
-        if env.fixed_members:
-            first.set(member_key, members_at(0))
         start = env.reset(first)
         return env.rollout(horizon, follow_the_plan, auto_reset=False, tensordict=start, return_contiguous=True)

@@ -98,8 +98,6 @@ class LatentEnv(ModelBasedEnvBase):
             self.constraint_prob_key: probability,
             self.goal_prob_key: probability.clone(),
         }
-        if self.fixed_members:
-            observed[self.dynamics.member_key] = Unbounded(shape=(1,), dtype=torch.int64, device=self.device)
         self.observation_spec = self._nested(observed)
         self.state_spec = self._nested({self.latent_key: latent.clone()})
         self.action_spec = self._nested({unravel_key(self.dynamics.in_keys[1]): action_spec.to(self.device)})
@@ -117,11 +115,6 @@ class LatentEnv(ModelBasedEnvBase):
         parameters = (p.dtype for p in self.dynamics.parameters() if p.is_floating_point())
         return next(parameters, torch.float32)
 
-    @property
-    def fixed_members(self) -> bool:
-        """Whether a particle keeps the member that it drew first (TS-∞)."""
-        return getattr(self.dynamics, "propagation", "ts1") == "tsinf"
-
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         if tensordict is None:
             tensordict = TensorDict({}, self.batch_size, device=self.device)
@@ -133,15 +126,7 @@ class LatentEnv(ModelBasedEnvBase):
         ):  # rows that need not begin anew stay as they are
             shape = (*tensordict.batch_size, self.latent_dim)
             latent = torch.randn(shape, device=self.device, dtype=self.latent_dtype)
-        out = self._observe(latent.to(self.latent_dtype), tensordict.batch_size)
-        if self.fixed_members:
-            key = self.dynamics.member_key
-            members = tensordict.get(key, None)
-            if members is None:
-                rows = out.batch_size.numel()
-                members = self.dynamics.sample_members(rows, device=self.device).reshape(*out.batch_size, 1)
-            out.set(key, members)
-        return out
+        return self._observe(latent.to(self.latent_dtype), tensordict.batch_size)
 
     def _require_nothing_else(self, tensordict: TensorDictBase) -> None:
         known = {unravel_key(key) for key in (*self.reset_keys, *self.done_keys)}
@@ -162,8 +147,6 @@ class LatentEnv(ModelBasedEnvBase):
         out = self._observe(moved.get(self.dynamics.out_keys[0]), tensordict.batch_size)
         goal_prob = out.get(self.goal_prob_key)
         out.set(self.reward_key, (goal_prob > 0.5).to(goal_prob) - 1.0)
-        if self.fixed_members:
-            out.set(self.dynamics.member_key, moved.get(self.dynamics.member_key))
         return out
 
     def _observe(self, latent: Tensor, batch_size: torch.Size) -> TensorDict:

@@ -58,6 +58,9 @@ class LS3Planner(MPCPlannerBase):
     nothing feasible was found, it acts on the plan with the fewest predicted violations and the safest end, never at
     random, and says so under ``("plan", "fallback")``.
 
+    All candidates of a row are scored by the same particles, members and noise alike (common random numbers), which
+    compares them with less variance.
+
     Plans for all rows of a batch at once, each with its own δ_S, warm start and reset. Use it as the policy of any
     collector or ``rollout``. An optimiser that starts from the last plan (``p_random`` below 1) needs that plan carried
     from step to step and dropped at a reset: ``Collector(auto_register_policy_transforms=True)`` does so by itself;
@@ -87,8 +90,6 @@ class LS3Planner(MPCPlannerBase):
         goal_reduction: over imagined steps, ``"count"`` of those that are more likely in the goal than not, as the
             authors' code, or ``"expected"``, the sum of the probabilities.
         pessimism: κ ≥ 0, subtracts κ standard deviations over the value ensemble; 0 is the paper.
-        common_noise: score all candidates of a row by the same particles (common random numbers), which
-            compares them with less variance; ``False`` draws noise for each.
         noise_scale: factor on the dynamics' learnt standard deviation, at least 0; 1 is the paper. With 0 the
             particles differ by their members alone. Where latents are samples of wide posteriors, most of that
             deviation is the posteriors' own, and with few particles it drowns what tells one plan from another.
@@ -151,7 +152,6 @@ class LS3Planner(MPCPlannerBase):
         safe_set_reduction: SafeSetReduction = "mean",
         goal_reduction: GoalReduction = "count",
         pessimism: float = 0.0,
-        common_noise: bool = True,
         noise_scale: float = 1.0,
         engine: EngineName = "auto",
         precision: Precision = "auto",
@@ -175,7 +175,6 @@ class LS3Planner(MPCPlannerBase):
             safe_set_reduction=safe_set_reduction,
             goal_reduction=goal_reduction,
             pessimism=pessimism,
-            common_noise=common_noise,
             noise_scale=noise_scale,
             engine=engine,
             precision=precision,
@@ -184,7 +183,7 @@ class LS3Planner(MPCPlannerBase):
         self.safe_set_threshold, self.constraint_threshold = safe_set_threshold, constraint_threshold
         self.relaxation, self.max_relaxations = float(relaxation), max_relaxations
         self.goal_reduction: GoalReduction = goal_reduction
-        self.pessimism, self.noise_scale, self.common_noise = pessimism, noise_scale, common_noise
+        self.pessimism, self.noise_scale = pessimism, noise_scale
         self.value, self.safe_set, self.encoder = value, safe_set, encoder
         self._require_modules()
         self.engine = Engine(
@@ -246,12 +245,12 @@ class LS3Planner(MPCPlannerBase):
         candidates, imagined = [], []
         for _ in range(self.optimizer.max_iterations(self.max_relaxations)):
             candidates.append(self.optimizer.sample_noise(rows, self.horizon, self.action_spec.shape[-1]))
-            imagined.append(self._sample_imagination_noise(batch, self.optimizer.num_candidates))
+            imagined.append(self._sample_imagination_noise(batch))
         members, dynamics = (torch.stack(parts) for parts in zip(*imagined, strict=True))
         return PlanNoise(tuple(torch.stack(parts) for parts in zip(*candidates, strict=True)), members, dynamics)
 
-    def _sample_imagination_noise(self, rows: int, candidates: int) -> ImaginationNoise:
-        sizes = (rows, self.horizon, self.num_particles, 1 if self.common_noise else candidates)
+    def _sample_imagination_noise(self, rows: int) -> ImaginationNoise:
+        sizes = (rows, self.horizon, self.num_particles)
         sampled = sample_imagination_noise(self.env, *sizes, device=self.action_spec.device)
         return sampled._replace(noise=self.noise_scale * sampled.noise)
 
@@ -316,7 +315,7 @@ class LS3Planner(MPCPlannerBase):
 
         def score(actions: Tensor, rows: Tensor, restarts: Tensor, iteration: int) -> PlanScores:
             if noise is None:
-                sampled = self._sample_imagination_noise(len(rows), self.optimizer.num_candidates)
+                sampled = self._sample_imagination_noise(len(rows))
             else:
                 sampled = noise.of_iteration(iteration, rows)
             threshold = self._threshold(restarts).unsqueeze(-1)
@@ -391,11 +390,7 @@ class LS3Planner(MPCPlannerBase):
 
     def imagine_plans(self, latent: Tensor, actions: Tensor) -> PlanStatistics:
         """What the planner imagines of given plans ``[B, N, H, A]`` from latents ``[B, D]``, for pictures."""
-        candidates = actions.shape[1]
-        sampled = self._sample_imagination_noise(len(latent), max(candidates, self.optimizer.num_candidates))
-        return self.imagine(
-            latent.float(), actions.float(), sampled._replace(noise=sampled.noise[:, :, :, :candidates])
-        )
+        return self.imagine(latent.float(), actions.float(), self._sample_imagination_noise(len(latent)))
 
 
 def _latent_key(encoder: TensorDictModuleBase | None, latent_key: NestedKey) -> NestedKey:

@@ -115,10 +115,6 @@ class LS3Trainer:
         """The learners by name, in the order in which they are trained."""
         return {name: getattr(self, name) for name in LEARNERS}
 
-    def _members(self, module: TensorDictModuleBase) -> int | None:
-        """Members of an ensemble that each learn from a batch of their own; ``None`` where all learn from the same."""
-        return getattr(module, "num_members", None) if self.options.optim.bootstrap else None
-
     def _batches(self, loss: LatentLoss, members: int | None = None, **rows: Any) -> BatchStream:
         """Batches for a loss, from the ``rows`` that a :class:`~ls3_torchrl.data.RowSelection` describes."""
         selection = RowSelection(online_fraction=self.options.online.fraction, **rows)
@@ -128,7 +124,7 @@ class LS3Trainer:
         """Equation (2)."""
         options, dynamics = self.options, self.agent.dynamics
         horizon = options.loss.dynamics_horizon
-        members = self._members(dynamics)
+        members = _members_of(dynamics)
         loss = EnsembleDynamicsLoss(dynamics, bootstrap=members is not None, steps=horizon)
         loss.set_keys(action=self.buffer.keys.action)
         without = None if self.buffer.dynamics_after_violation else "after_violation"
@@ -138,7 +134,7 @@ class LS3Trainer:
     def _value_learner(self) -> Learner:
         """Equation (3), and the value of failure where it is asked for."""
         options, value = self.options, self.agent.value
-        members = self._members(value)
+        members = _members_of(value)
         bootstrap = members is not None
         auxiliary = None
         if options.loss.failure_weight > 0.0:
@@ -151,7 +147,7 @@ class LS3Trainer:
     def _value_td_learner(self) -> Learner:
         """Equation (4)."""
         options, value = self.options, self.agent.value
-        members = self._members(value)
+        members = _members_of(value)
         loss = TD1ValueLoss(
             value,
             gamma=self.buffer.gamma,
@@ -273,3 +269,8 @@ class LS3Trainer:
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue where :meth:`state_dict` was taken."""
         self._group.load_state_dict(state_dict)
+
+
+def _members_of(module: TensorDictModuleBase) -> int | None:
+    """Members of an ensemble, each of which learns from a batch of its own (Chua et al.); ``None`` for what is none."""
+    return getattr(module, "num_members", None)

@@ -98,7 +98,7 @@ class VAETrainer:
         self.finished = False
         for half in (agent.encoder, agent.decoder):
             half.to(memory_format=torch.channels_last)
-        self.loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta, reduction=options.reduction)
+        self.loss = VAELoss(agent.encoder, agent.decoder, beta=options.beta)
         self._learnt = list(self.loss.parameters())
         self.prediction: LatentPredictionLoss | None = None
         if options.prediction_weight:
@@ -130,7 +130,7 @@ class VAETrainer:
             self._take_checkpoint(self.options.checkpoint)
         else:
             self._minimise()
-            if self.options.reduction == "mean" and not self._checked:
+            if not self._checked:
                 self._warn_of_collapse(self._error)
             self._checked = True
         self.encode()

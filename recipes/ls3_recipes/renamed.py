@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -25,7 +26,17 @@ RENAMED = {
 }
 
 #: Settings that are gone, and the value that is the only one now.
-REMOVED: dict[str, Any] = {"vae.crop_scale": None, "offline.value_td_steps": 0}
+REMOVED: dict[str, Any] = {
+    "vae.crop_scale": None,
+    "offline.value_td_steps": 0,
+    "vae.reduction": "mean",
+    "optim.bootstrap": True,
+    "agent.propagation": "ts1",
+    "planner.common_noise": True,
+    "planner.min_std": 0.0,
+    "policy.learn_alpha": False,
+    "policy.zero_at_goal": False,
+}
 
 #: Of the benchmark, whose settings have no sections.
 RENAMED_OF_BENCHMARK = {"plain": "reference"}
@@ -133,7 +144,7 @@ def removed(name: str) -> str:
         >>> removed("vae.crop_scale")
         'The setting vae.crop_scale is gone: all runs do now what it did at null. Leave it out.'
     """
-    only = "null" if REMOVED[name] is None else REMOVED[name]
+    only = json.dumps(REMOVED[name]).strip('"')
     return f"The setting {name} is gone: all runs do now what it did at {only}. Leave it out."
 
 

@@ -10,9 +10,9 @@ from torchrl.envs.utils import step_mdp
 from ls3_torchrl.modules import EnsembleDynamics
 
 
-def shifting_dynamics(num_members: int, **options: object) -> EnsembleDynamics:
+def shifting_dynamics(num_members: int) -> EnsembleDynamics:
     """Member m adds m to the latent, nearly without noise: the latent tells which member moved it."""
-    dynamics = EnsembleDynamics(1, 1, num_members=num_members, hidden=(), **options)
+    dynamics = EnsembleDynamics(1, 1, num_members=num_members, hidden=())
     with torch.no_grad():
         dynamics.network.weights[0].zero_()
         dynamics.network.biases[0][:, 0, 0] = torch.arange(float(num_members))
@@ -35,7 +35,6 @@ def test_default_network_is_five_members_of_two_layers_of_128():
         (5, 128, 128),
         (5, 128, 64),
     ]
-    assert dynamics.propagation == "ts1"
 
 
 def test_next_latent_equals_a_computation_by_hand():
@@ -188,17 +187,6 @@ def test_ts1_samples_members_anew_at_every_step():
     assert not torch.equal(first, second)
 
 
-def test_tsinf_keeps_each_particles_member():
-    dynamics = shifting_dynamics(5, propagation="tsinf")
-    td = dynamics(rest(40))
-    first = members_used(td)
-    assert torch.bincount(first, minlength=5).tolist() == [8] * 5
-    assert torch.equal(td["dynamics_member"].flatten(), first)
-    for _ in range(2):
-        td = dynamics(step_mdp(td).set("action", torch.zeros(40, 1)))
-        assert torch.equal(members_used(td), first)
-
-
 def test_given_members_and_noise_make_a_step_repeatable_in_any_batch_shape():
     dynamics = EnsembleDynamics(3, 2, num_members=4, hidden=(8,))
     td = TensorDict({"latent": torch.randn(2, 6, 3), "action": torch.randn(2, 6, 2)}, [2, 6])
@@ -221,12 +209,13 @@ def test_nested_keys():
         next_latent_key=("next", "model", "z"),
         member_key=("model", "member"),
         noise_key=("model", "noise"),
-        propagation="tsinf",
     )
     latent, noise = torch.randn(6, 3), torch.randn(6, 3)
-    td = TensorDict({"model": {"z": latent, "noise": noise}, "agent": {"action": torch.randn(6, 2)}}, [6])
+    member = torch.tensor([[0], [3], [1], [2], [3], [0]])
+    td = TensorDict(
+        {"model": {"z": latent, "noise": noise, "member": member}, "agent": {"action": torch.randn(6, 2)}}, [6]
+    )
     dynamics(td)
-    member = td["model", "member"]
     loc, scale = dynamics.distribution(latent, td["agent", "action"])
     rows = torch.arange(6)
     expected = loc[rows, member[:, 0]] + scale[rows, member[:, 0]] * noise
@@ -241,8 +230,6 @@ def test_missing_keys_are_named():
 
 
 def test_bad_options_are_refused():
-    with pytest.raises(ValueError, match="propagation must be one of 'ts1', 'tsinf'; got 'ts2'"):
-        EnsembleDynamics(3, 2, propagation="ts2")
     with pytest.raises(ValueError, match="log_scale_bounds must rise"):
         EnsembleDynamics(3, 2, log_scale_bounds=(1.0, 1.0))
     with pytest.raises(ValueError, match="num_members must be at least 1"):

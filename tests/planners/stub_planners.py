@@ -49,11 +49,11 @@ def stub_planner(
     return LS3Planner(env, values, safe_set or classifier(SafeSet, prob=0.99), encoder, **options)
 
 
-def random_planner(propagation="ts1", *, constraint_bias=0.0, **options):
+def random_planner(*, constraint_bias=0.0, **options):
     """Random networks, so that nothing is symmetric; their probabilities spread round one half."""
     torch.manual_seed(0)
     env = LatentEnv(
-        EnsembleDynamics(D, A, num_members=3, hidden=(8,), propagation=propagation),
+        EnsembleDynamics(D, A, num_members=3, hidden=(8,)),
         ConstraintEstimator(D, hidden=(8,)),
         GoalEstimator(D, hidden=(8,)),
         action_spec=Bounded(low=torch.tensor([-3.0, 0.5]), high=torch.tensor([-1.0, 2.0]), shape=(A,)),

@@ -53,7 +53,7 @@ def test_finds_an_optimum_at_a_corner_of_asymmetric_bounds():
 @pytest.mark.parametrize("p_random", [0.0, 0.4, 1.0])
 def test_every_candidate_and_result_lies_in_the_box(p_random):
     torch.manual_seed(0)
-    cem = CrossEntropyMethod(num_candidates=60, num_elites=5, optim_steps=4, p_random=p_random, min_std=0.5)
+    cem = CrossEntropyMethod(num_candidates=60, num_elites=5, optim_steps=4, p_random=p_random)
     record = Record(quadratic([9.0, 9.0]))
     # The warm start lies far out.
     start = torch.full((2, 3, 2), 10.0)
@@ -65,7 +65,7 @@ def test_every_candidate_and_result_lies_in_the_box(p_random):
 
 def test_one_elite_refits_on_the_best_alone():
     torch.manual_seed(0)
-    cem = CrossEntropyMethod(num_candidates=50, num_elites=1, optim_steps=3, min_std=0.0)
+    cem = CrossEntropyMethod(num_candidates=50, num_elites=1, optim_steps=3)
     record = Record(quadratic([-2.0, 1.0]))
     result = cem(record, LOW, HIGH, batch=1, horizon=2)
     actions, *_, scores = record.asked[0]
@@ -74,13 +74,6 @@ def test_one_elite_refits_on_the_best_alone():
     assert (result.std == 0).all()
     # Without any spread the later rounds repeat it.
     assert (record.asked[2][0] == result.actions[:, None]).all()
-
-
-def test_min_std_is_a_share_of_each_side():
-    torch.manual_seed(0)
-    cem = CrossEntropyMethod(num_candidates=50, num_elites=1, optim_steps=2, min_std=0.1)
-    result = cem(quadratic([-2.0, 1.0]), LOW, HIGH, batch=1, horizon=2)
-    torch.testing.assert_close(result.std, torch.tensor([0.2, 0.15]).expand(1, 2, 2))
 
 
 def test_elites_refit_by_hand():
@@ -412,8 +405,8 @@ def test_a_negative_number_of_restarts_is_refused():
 
 def test_the_defaults_are_the_papers():
     cem = CrossEntropyMethod()
-    settings = (cem.num_candidates, cem.num_elites, cem.optim_steps, cem.p_random, cem.p_constant, cem.min_std)
-    assert settings == (1000, 100, 4, 1.0, 0.0, 0.0)  # Table 1; n_cem_iters = 5 scores four
+    settings = (cem.num_candidates, cem.num_elites, cem.optim_steps, cem.p_random, cem.p_constant)
+    assert settings == (1000, 100, 4, 1.0, 0.0)  # Table 1; n_cem_iters = 5 scores four
     assert not cem.uses_warm_start
 
 
@@ -472,7 +465,6 @@ def test_the_given_start_is_left_as_it_was():
         ({"p_random": -0.1}, r"p_random must lie in \[0, 1\]"),
         ({"p_constant": -0.1}, r"p_constant must lie in \[0, 1\]"),
         ({"p_random": 0.6, "p_constant": 0.5}, "together they must not exceed 1"),
-        ({"min_std": -0.1}, "min_std must not be negative"),
     ],
 )
 def test_settings_out_of_range_are_refused(wrong, message):

@@ -12,10 +12,10 @@ D, A, M = 4, 2, 3
 B, N, H, P = 2, 6, 3, 5
 
 
-def modules(propagation="ts1", num_members=M):
+def modules(num_members=M):
     torch.manual_seed(0)
     env = LatentEnv(
-        EnsembleDynamics(D, A, num_members=num_members, hidden=(8,), propagation=propagation),
+        EnsembleDynamics(D, A, num_members=num_members, hidden=(8,)),
         ConstraintEstimator(D, hidden=(8,)),
         GoalEstimator(D, hidden=(8,)),
         action_spec=Bounded(low=-1.0, high=1.0, shape=(A,)),
@@ -23,10 +23,10 @@ def modules(propagation="ts1", num_members=M):
     return env, ValueEnsemble(D, num_members=2, hidden=(8,)), SafeSet(D, hidden=(8,))
 
 
-def problem(*, common=True, fixed=False):
-    env, *_ = modules("tsinf" if fixed else "ts1")
+def problem():
+    env, *_ = modules()
     torch.manual_seed(1)
-    noise = sample_imagination_noise(env, B, H, P, 1 if common else N)
+    noise = sample_imagination_noise(env, B, H, P)
     return 2 * torch.randn(B, D), torch.rand(B, N, H, A) * 2 - 1, noise
 
 
@@ -39,8 +39,8 @@ def particle_by_particle(env, value, safe_set, latent, actions, noise, reduction
             z = latent[b]
             for t in range(H):
                 loc, scale = env.dynamics.distribution(z, actions[b, n, t])
-                member, own = noise.members[t, p], noise.noise[b, t, p]
-                z = loc[member] + scale[member] * own[n if len(own) > 1 else 0]
+                member = noise.members[t, p]
+                z = loc[member] + scale[member] * noise.noise[b, t, p]
                 goals[b, n, p, t] = env.goal.probability(z).squeeze()
                 constraints[b, n, p, t] = env.constraint.probability(z).squeeze()
             values[b, n, p] = value.network(z).squeeze(-1)
@@ -49,16 +49,10 @@ def particle_by_particle(env, value, safe_set, latent, actions, noise, reduction
     return values.mean(2), goals.mean(2), constraint, safe.amin(2) if safe_reduction == "min" else safe.mean(2)
 
 
-cases = pytest.mark.parametrize(
-    ("propagation", "reduction", "common"),
-    list(itertools.product(["ts1", "tsinf"], ["max", "mean"], [True, False])),
-)
-
-
-@cases
-def test_rollout_imagination_follows_the_definition(propagation, reduction, common):
-    env, value, safe_set = modules(propagation)
-    latent, actions, noise = problem(common=common, fixed=propagation == "tsinf")
+@pytest.mark.parametrize("reduction", ["max", "mean"])
+def test_rollout_imagination_follows_the_definition(reduction):
+    env, value, safe_set = modules()
+    latent, actions, noise = problem()
     imagine = RolloutImagination(env, value, safe_set, constraint_reduction=reduction)
     expected = particle_by_particle(env, value, safe_set, latent, actions, noise, reduction)
     for name, got, want in zip(
@@ -67,20 +61,19 @@ def test_rollout_imagination_follows_the_definition(propagation, reduction, comm
         torch.testing.assert_close(got, want, atol=1e-5, rtol=1e-4, msg=name)
 
 
-@cases
-def test_the_fused_engine_gives_the_same_statistics(propagation, reduction, common):
-    env, value, safe_set = modules(propagation)
-    latent, actions, noise = problem(common=common, fixed=propagation == "tsinf")
+@pytest.mark.parametrize("reduction", ["max", "mean"])
+def test_the_fused_engine_gives_the_same_statistics(reduction):
+    env, value, safe_set = modules()
+    latent, actions, noise = problem()
     plain = RolloutImagination(env, value, safe_set, constraint_reduction=reduction)(latent, actions, noise)
     fused = FusedImagination(env, value, safe_set, constraint_reduction=reduction, precision="fp32")
     for name, got, want in zip(plain._fields, fused(latent, actions, noise), plain, strict=True):
         torch.testing.assert_close(got, want, atol=1e-4, rtol=1e-4, msg=name)
 
 
-@pytest.mark.parametrize("common", [True, False])
-def test_every_particle_must_end_in_the_safe_set_under_min(common):
+def test_every_particle_must_end_in_the_safe_set_under_min():
     env, value, safe_set = modules()
-    latent, actions, noise = problem(common=common)
+    latent, actions, noise = problem()
     expected = particle_by_particle(env, value, safe_set, latent, actions, noise, "max", "min")[-1]
     for engine in (RolloutImagination, FusedImagination):
         options = {"precision": "fp32"} if engine is FusedImagination else {}
@@ -94,7 +87,7 @@ def test_every_particle_must_end_in_the_safe_set_under_min(common):
 def test_reductions_and_noise_make_a_difference():
     # Otherwise the comparisons above would show little.
     env, value, safe_set = modules()
-    latent, actions, noise = problem(common=False)
+    latent, actions, noise = problem()
     largest, mean = (
         RolloutImagination(env, value, safe_set, constraint_reduction=r)(latent, actions, noise).constraint_prob
         for r in ("max", "mean")
@@ -106,9 +99,9 @@ def test_reductions_and_noise_make_a_difference():
     assert not torch.allclose(imagine(latent, actions, noise).value, imagine(latent, actions, other).value, atol=1e-3)
 
 
-def test_under_common_noise_equal_plans_are_rated_equally():
+def test_equal_plans_are_rated_equally_since_their_noise_is_the_same():
     env, value, safe_set = modules()
-    latent, actions, noise = problem(common=True)
+    latent, actions, noise = problem()
     same = actions[:, :1].expand(-1, N, -1, -1)
     for field in RolloutImagination(env, value, safe_set)(latent, same, noise):
         torch.testing.assert_close(field, field[:, :1].expand_as(field))
@@ -123,10 +116,10 @@ def test_imagining_leaves_no_gradients_and_draws_nothing():
     assert torch.equal(before, torch.get_rng_state())
 
 
-def sampled_members(num_members, horizon, particles, propagation="ts1"):
-    env, *_ = modules(propagation, num_members)
+def sampled_members(num_members, horizon, particles):
+    env, *_ = modules(num_members)
     torch.manual_seed(0)
-    return sample_imagination_noise(env, 1, horizon, particles, 1).members
+    return sample_imagination_noise(env, 1, horizon, particles).members
 
 
 def test_members_split_the_particles_evenly_and_anew_at_each_step():
@@ -147,9 +140,3 @@ def test_an_uneven_split_differs_by_one_and_favours_nobody():
     assert counts.max() == 2
     # The member that gets the odd particle: 200 of 600 each, deviation 11.5.
     assert ((counts == 2).sum(0) - 200).abs().max() < 5 * 11.5
-
-
-def test_fixed_members_stay_over_the_horizon():
-    members = sampled_members(3, 4, 7, propagation="tsinf")
-    assert members.shape == (4, 7)
-    assert (members == members[0]).all()

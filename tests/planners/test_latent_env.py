@@ -24,9 +24,9 @@ def linear_classifier(kind, slope, offset):
     return module
 
 
-def linear_world(propagation="ts1", scale=0.5):
+def linear_world(scale=0.5):
     """Member m moves z by (m + 1) * (a_0, a_1, 0, 0) with standard deviation ``scale``."""
-    dynamics = EnsembleDynamics(D, A, num_members=M, hidden=(), propagation=propagation)
+    dynamics = EnsembleDynamics(D, A, num_members=M, hidden=())
     with torch.no_grad():
         dynamics.network.weights[0].zero_()
         dynamics.network.biases[0].zero_()[..., D:] = math.log(scale)
@@ -61,9 +61,8 @@ def test_one_step_by_hand():
 
 def test_specs_hold():
     torch.manual_seed(0)
-    for propagation in ("ts1", "tsinf"):
-        env = linear_world(propagation)
-        check_env_specs(env, tensordict=env.reset(TensorDict({"latent": torch.zeros(3, D)}, [3])))
+    env = linear_world()
+    check_env_specs(env, tensordict=env.reset(TensorDict({"latent": torch.zeros(3, D)}, [3])))
 
 
 @pytest.mark.parametrize("batch", [[], [1], [5], [2, 3], [2, 3, 4]])
@@ -85,32 +84,9 @@ def test_it_never_ends_an_episode():
     assert not path["next", "done"].any()
 
 
-def test_ts_infinity_keeps_each_particles_member():
-    torch.manual_seed(0)
-    env = linear_world("tsinf")
-    start = env.reset(TensorDict({"latent": torch.zeros(30, D)}, [30]))
-    path = env.rollout(6, auto_reset=False, tensordict=start)
-    member = path["next", "dynamics_member"].squeeze(-1)
-    assert (member == member[:, :1]).all()
-    assert torch.equal(member[:, 0], start["dynamics_member"].flatten())
-    assert torch.bincount(member[:, 0], minlength=M).tolist() == [10, 10, 10]
-
-
-def test_ts_infinity_really_moves_by_that_member():
-    env = linear_world("tsinf", scale=1e-3)
-    start = TensorDict({"latent": torch.zeros(3, D), "dynamics_member": torch.tensor([[0], [1], [2]])}, [3])
-    path = env.rollout(
-        4,
-        lambda td: td.set("action", torch.tensor([[1.0, 0.0]]).expand(3, -1)),
-        auto_reset=False,
-        tensordict=env.reset(start),
-    )
-    torch.testing.assert_close(path["next", "latent"][:, -1, 0], torch.tensor([4.0, 8.0, 12.0]), atol=0.05, rtol=0)
-
-
 def test_ts1_changes_members_on_the_way():
     torch.manual_seed(0)
-    env = linear_world("ts1", scale=1e-3)
+    env = linear_world(scale=1e-3)
     start = env.reset(TensorDict({"latent": torch.zeros(30, D)}, [30]))
     path = env.rollout(
         6,
@@ -166,11 +142,10 @@ def test_a_tensordict_that_has_no_latent_among_its_entries_is_refused():
 KEYS = {"latent_key": ("see", "z"), "action_key": ("agent", "u"), "next_latent_key": ("model", "following")}
 
 
-@pytest.mark.parametrize("propagation", ["ts1", "tsinf"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16])
 @pytest.mark.parametrize("keys", [{}, {"action_key": "u"}, KEYS], ids=["default", "action", "nested"])
-def test_specs_hold_for_any_keys_and_dtypes(keys, dtype, propagation):
-    dynamics = EnsembleDynamics(D, A, propagation=propagation, member_key=("model", "member"), **keys)
+def test_specs_hold_for_any_keys_and_dtypes(keys, dtype):
+    dynamics = EnsembleDynamics(D, A, member_key=("model", "member"), **keys)
     spec = Bounded(low=-1.0, high=1.0, shape=(A,), dtype=dtype)
     modules = [dynamics, ConstraintEstimator(D, latent_key="x"), GoalEstimator(D, latent_key=("y", "z"))]
     for parts in (modules, [module.to(torch.float64) for module in modules]):

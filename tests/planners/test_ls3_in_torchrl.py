@@ -39,7 +39,7 @@ def collect(env, policy, **options):
 
 def test_rollout_carries_the_warm_start_and_drops_it_with_the_episode():
     torch.manual_seed(0)
-    planner = stub_planner(p_random=0.5, min_std=0.05)
+    planner = stub_planner(p_random=0.5)
     path = corridor(planner).rollout(9, planner, break_when_any_done=False)
     assert_warm_starts_are_carried(path)
     assert ("plan", "score") in path.keys(True)
@@ -47,19 +47,19 @@ def test_rollout_carries_the_warm_start_and_drops_it_with_the_episode():
 
 def test_collector_carries_the_warm_start_and_drops_it_with_the_episode():
     torch.manual_seed(0)
-    planner = stub_planner(p_random=0.5, min_std=0.05)
+    planner = stub_planner(p_random=0.5)
     assert_warm_starts_are_carried(collect(corridor(planner), planner))
 
 
 def test_nested_keys_are_carried_too():
     torch.manual_seed(0)
-    planner = stub_planner(p_random=0.5, min_std=0.05, plan_key=("ls3", "plan"))
+    planner = stub_planner(p_random=0.5, plan_key=("ls3", "plan"))
     path = corridor(planner).rollout(9, planner, break_when_any_done=False)
     assert_warm_starts_are_carried(path, ("ls3", "plan"))
 
 
 def test_the_carried_start_is_what_the_next_plan_begins_with():
-    planner = stub_planner(p_random=0.0, min_std=0.05)
+    planner = stub_planner(p_random=0.0)
     env = corridor(planner)
     # Noise free: the first plan is the middle of the box, so make the second start elsewhere by hand.
     noise = still(planner.sample_noise(2))
@@ -72,7 +72,7 @@ def test_the_carried_start_is_what_the_next_plan_begins_with():
 
 def test_a_collector_finds_the_warm_start_by_itself():
     torch.manual_seed(0)
-    planner = stub_planner(p_random=0.5, min_std=0.05)
+    planner = stub_planner(p_random=0.5)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         assert_warm_starts_are_carried(collect(Corridor(), planner, auto_register_policy_transforms=True))
@@ -145,7 +145,7 @@ def test_in_keys_are_what_is_read_and_out_keys_what_is_written(p_random, plan_ke
 
 
 def test_a_sequence_passes_the_keys_on():
-    planner = stub_planner(p_random=0.5, min_std=0.05)
+    planner = stub_planner(p_random=0.5)
     policy = TensorDictSequential(TensorDictModule(nn.Identity(), ["latent"], ["seen"]), planner)
     assert policy.in_keys == ["latent", ("plan", "mean"), ("plan", "std"), "is_init"]
     assert policy.out_keys == ["seen", *planner.out_keys]
@@ -195,7 +195,7 @@ def test_what_was_compiled_for_a_gpu_is_not_copied(monkeypatch):
 def test_a_collector_may_compile_the_planner():
     torch.manual_seed(0)
     encoder = TensorDictModule(nn.Sequential(nn.Linear(D, 8), nn.Tanh(), nn.Linear(8, D)), ["latent"], ["embedding"])
-    planner = stub_planner(p_random=0.5, min_std=0.05, encoder=encoder)
+    planner = stub_planner(p_random=0.5, encoder=encoder)
     torch._dynamo.reset()
     torch._dynamo.utils.counters.clear()
     path = collect(corridor(planner), planner, compile_policy={"backend": "aot_eager"})

@@ -46,7 +46,7 @@ def test_it_is_what_the_environment_imagines(members, control_affine, scale, blo
     fused, plain = both(control_affine=control_affine, block=block)
     torch.manual_seed(1)
     steps = torch.stack([torch.tensor(members).roll(t) for t in range(H)])
-    noise = ImaginationNoise(steps, scale * torch.randn(B, H, len(members), 1, D))
+    noise = ImaginationNoise(steps, scale * torch.randn(B, H, len(members), D))
     latent, actions = torch.randn(B, D), torch.rand(B, N, H, A) * 2 - 1
     for name, one, other in zip(
         plain(latent, actions, noise)._fields,

@@ -93,7 +93,6 @@ def test_data_of_another_task_are_refused_before_any_work(no_work, tmp_path):
             r"^planner\.safe_set_threshold must lie strictly between 0 and 1",
         ),
         ("planner.engine=jax", ValueError, "'auto', 'fused', 'rollout'"),
-        ("agent.propagation=ts2", ValueError, "'ts1', 'tsinf'"),
         ("agent.action_scale=range", ValueError, "'box'"),
         ("buffer.capacity=0", ValueError, r"^buffer\.capacity must be at least 1"),
         ("buffer.success_tail=0", ValueError, r"^buffer\.success_tail must be at least 1"),

@@ -43,12 +43,12 @@ class ActorCritic(Baseline):
         return super().make_learners(horizon)
 
     def sample(self, tags: Iterable[Tag]) -> TensorDictBase:
-        """Transitions with penalised rewards, and the ends that a critic should know of."""
+        """Transitions with penalised rewards, none of which ends the task: neither goal nor violation does."""
         rows = super().sample(tags)
         reached = rows.get("next")
         violated = reached["constraint"]
         reached.set("reward", reached["reward"] + self.options.penalty * violated - self.bonus)
-        over = reached["success"] if self.options.zero_at_goal else torch.zeros_like(violated)
+        over = torch.zeros_like(violated)
         reached.set("terminated", over)
         reached.set("done", over)
         return rows

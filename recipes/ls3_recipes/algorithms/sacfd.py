@@ -74,10 +74,9 @@ class SACfD(ActorCritic):
         """With those of the critic alone, of actor and critic, and with recovery of risk and recovery policy."""
         learners = super().make_learners(horizon)
         policy, sac = self.settings.policy, self._sac_loss()
-        names = ["actor", "qvalue", *(["alpha"] if policy.learn_alpha else [])]
         learners |= {
             "critic": self.learner("qvalue", sac, lambda: self.sample(DEMONSTRATIONS), tau=policy.tau),
-            "both": self.learner(names, sac, self._sample_wanted, tau=policy.tau),
+            "both": self.learner(["actor", "qvalue"], sac, self._sample_wanted, tau=policy.tau),
         }
         return learners | (self._recovery_learners() if self.recovery else {})
 
@@ -85,16 +84,14 @@ class SACfD(ActorCritic):
         policy, gamma = self.settings.policy, as_dict(self.settings.buffer)["gamma"]
         # In the actions' own units entropies lie this much above those in units of half the box. Without a correction,
         # every step would be rewarded for the units that the actions are measured in.
-        offset = float(self.half.log().sum())
-        if not policy.learn_alpha:
-            self.bonus = gamma * policy.alpha * offset
+        self.bonus = gamma * policy.alpha * float(self.half.log().sum())
         loss = SACLoss(
             self.networks["actor"],
             self.networks["critic"],
             loss_function="l2",
             alpha_init=policy.alpha,
-            fixed_alpha=not policy.learn_alpha,
-            target_entropy=offset - float(len(self.half)),
+            fixed_alpha=True,
+            target_entropy=0.0,  # TorchRL wants one, which nothing is learnt from
         )
         loss.make_value_estimator(gamma=gamma)
         return loss

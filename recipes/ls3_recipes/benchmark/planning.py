@@ -103,7 +103,7 @@ def agreement(agent: LS3Agent, options: dict[str, Any], spec: Bounded, frames: T
         latent = exact.encode(TensorDict({"pixels": frame[None].to(space.low.device)}, [1]))
         noise = exact.sample_noise(1)
         plans = torch.cat([planner.plan(latent, noise=noise).actions for planner in (exact, rough)])[None]
-        drawn = ImaginationNoise(noise.members[0], noise.dynamics[0][:, :, :, :1])
+        drawn = ImaginationNoise(noise.members[0], noise.dynamics[0])
         threshold = torch.full((1, 1), exact.safe_set_threshold or 0.0, device=latent.device)
         one, other = exact.score_plans(exact.imagine(latent, plans, drawn), threshold).score[0]
         errors.append(float((one - other).abs() / one.abs().clamp(min=1.0)))

@@ -26,7 +26,7 @@ MISTAKES = {
         ((*TRAIN, "offline.dynamics_steps=1.5"), "offline.dynamics_steps must be a whole number, got 1.5."),
         ((*TRAIN, "pictures=maybe"), "pictures must be true or false, got 'maybe'."),
         ((*TRAIN, "pictures=1"), "pictures must be true or false, got 1."),
-        ((*TRAIN, "planner.common_noise=sometimes"), "planner.common_noise must be true or false"),
+        ((*TRAIN, "loss.monte_carlo=sometimes"), "loss.monte_carlo must be true or false"),
         ((*TRAIN, "agent.value_hidden=16"), "agent.value_hidden must be a list of whole numbers, got 16."),
         (
             (*TRAIN, "agent.value_hidden=[16,big]"),
@@ -56,7 +56,7 @@ MISTAKES = {
         ((*TRAIN, "threads=-2"), "threads must be at least 1, or null"),
         ((*TRAIN, "online.dynamics_steps=-3"), "online.dynamics_steps must be at least 0, got -3."),
         ((*TRAIN, "planner.pessimism=nan"), "planner.pessimism must be a finite number, got nan."),
-        ((*TRAIN, "planner.min_std=-inf"), "planner.min_std must be a finite number, got -inf."),
+        ((*TRAIN, "planner.noise_scale=-inf"), "planner.noise_scale must be a finite number, got -inf."),
         ((*TRAIN, "agent.initial_value=inf"), "agent.initial_value must be a finite number, got inf."),
         ((*TRAIN, "loss.failure_value=nan"), "loss.failure_value must be a finite number, or null, got nan."),
         ((*TRAIN, "agent.action_scale=0"), "agent.action_scale must be a finite number above 0, got 0.0."),

@@ -42,7 +42,6 @@ class ActorCriticSettings(PolicySettings):
         penalty: λ, added to the reward of a violation; at most 0.
         initial_std: of an untrained actor, before squashing.
         tau: of the lagged critics, in (0, 1]; a value that is wrong for ever sinks by 1 in 1 / tau steps.
-        zero_at_goal: the goal ends the task, whatever happens after.
         critic_steps: gradient steps offline.
         updates_per_step: gradient steps online, for each step of the environment.
     """
@@ -50,7 +49,6 @@ class ActorCriticSettings(PolicySettings):
     penalty: float
     initial_std: float = 1.0
     tau: float = 0.005
-    zero_at_goal: bool = False
     critic_steps: int = 5000
     updates_per_step: float = 1.0
 
@@ -118,12 +116,10 @@ class SACfDPolicySettings(ActorCriticSettings):
 
     Args:
         alpha: weight of the entropy, for rewards of -1 a step; above 0.
-        learn_alpha: whether it is learnt.
         risk: of the safety critic, which there is with recovery alone.
     """
 
     alpha: float = 0.2
-    learn_alpha: bool = False
     risk: RiskSettings
 
     def __post_init__(self) -> None:
