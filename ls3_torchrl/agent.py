@@ -37,7 +37,7 @@ _PACKAGES = ("ls3-torchrl", "torch", "torchrl", "tensordict")
 #: Settings that are gone, in files of before, and the value that is the only one now.
 _REMOVED: dict[str, dict[str, Any]] = {
     "architecture": {"propagation": "ts1"},
-    "planner": {"common_noise": True, "min_std": 0.0},
+    "planner": {"common_noise": True, "constraint_reduction": "max", "min_std": 0.0},
 }
 
 
@@ -342,7 +342,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _drop_removed(path: Path, content: dict[str, Any]) -> None:
-    """Leave out what is gone; refuse an agent that it made another one."""
+    """Leave out what is gone, and say where the agent planned otherwise with it. Its weights stay right."""
     for group, removed in _REMOVED.items():
         values = content.get(group)
         if not isinstance(values, dict):
@@ -350,9 +350,10 @@ def _drop_removed(path: Path, content: dict[str, Any]) -> None:
         for name, only in removed.items():
             value = values.pop(name, only)
             if value != only:
-                raise ValueError(
-                    f"{path} holds an agent with {name}={value!r}. That setting is gone: all agents are now what they "
-                    f"were at {only!r}. Train again, or install the library version that wrote it."
+                warnings.warn(
+                    f"{path} holds an agent with {name}={value!r}. That setting is gone: it plans now as at {only!r}. For "
+                    "the plans of before, install the library version that wrote it.",
+                    stacklevel=4,
                 )
 
 

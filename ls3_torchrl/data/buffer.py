@@ -49,8 +49,6 @@ class TaggedReplayBuffer:
             (:func:`~ls3_torchrl.data.failure_tail`), instead of ending with the horizon.
         success_tail: steps kept of the successes that an episode ends with; ``None`` keeps all. Once the task is done
             nothing happens, and such steps can be most of the data.
-        dynamics_after_violation: whether dynamics are to be learnt from steps behind a violation, which freezes some
-            worlds. The rows are kept all the same; who trains leaves them out with ``without="after_violation"``.
         keys: where episodes keep their entries, and where sampled rows have them; the defaults of
             :class:`~ls3_torchrl.data.EpisodeKeys` when ``None``.
         extra_keys: further entries of the episodes that are kept with their transitions.
@@ -98,7 +96,6 @@ class TaggedReplayBuffer:
         gamma: float = 0.99,
         continue_failures: bool = False,
         success_tail: int | None = None,
-        dynamics_after_violation: bool = True,
         keys: EpisodeKeys | None = None,
         extra_keys: Iterable[NestedKey] = (),
         frame_capacity: int | None = None,
@@ -116,7 +113,6 @@ class TaggedReplayBuffer:
                 "return minus infinity. Lower it, for example to 0.99."
             )
         self.success_tail = None if success_tail is None else int(success_tail)
-        self.dynamics_after_violation = dynamics_after_violation
         self.device = torch.device(device)
         self.keys = keys or EpisodeKeys()
         self.extra_keys = tuple(unravel_key(key) for key in extra_keys)

@@ -23,7 +23,6 @@ class BufferOptions:
     gamma: float = 0.99
     continue_failures: bool = False
     success_tail: int | None = None
-    dynamics_after_violation: bool = True
 
     def __post_init__(self) -> None:
         require_at_least(self.capacity, 1, "capacity")

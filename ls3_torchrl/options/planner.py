@@ -7,7 +7,6 @@ from typing import Literal
 
 from ls3_torchrl._values import require_at_least, require_choice, require_not_negative, require_probability
 
-ConstraintReduction = Literal["max", "mean"]
 GoalReduction = Literal["count", "expected"]
 SafeSetReduction = Literal["mean", "min"]
 EngineName = Literal["auto", "fused", "rollout"]
@@ -32,7 +31,6 @@ class ControlOptions:
     constraint_threshold: float | None = 0.2
     relaxation: float = 0.8
     max_relaxations: int = 5
-    constraint_reduction: ConstraintReduction = "max"
     safe_set_reduction: SafeSetReduction = "mean"
     goal_reduction: GoalReduction = "count"
     pessimism: float = 0.0
@@ -53,7 +51,6 @@ class ControlOptions:
             require_not_negative(getattr(self, name), name)
         require_choice(self.engine, ("auto", "fused", "rollout"), "engine")
         require_choice(self.precision, ("auto", "fp32", "bf16"), "precision")
-        require_choice(self.constraint_reduction, ("max", "mean"), "constraint_reduction")
         require_choice(self.safe_set_reduction, ("mean", "min"), "safe_set_reduction")
 
 
@@ -70,14 +67,14 @@ class CEMOptions:
     """
 
     num_candidates: int = 1000
-    num_elites: int = 100
+    num_elites: int | None = None
     optim_steps: int = 4
     p_random: float = 1.0
     p_constant: float = 0.0
 
     def __post_init__(self) -> None:
         require_at_least(self.num_candidates, 1, "num_candidates")
-        if not 1 <= self.num_elites <= self.num_candidates:
+        if self.num_elites is not None and not 1 <= self.num_elites <= self.num_candidates:
             raise ValueError(
                 f"num_elites must lie between 1 and num_candidates = {self.num_candidates}, got {self.num_elites}."
             )

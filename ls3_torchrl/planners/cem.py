@@ -76,7 +76,8 @@ class CrossEntropyMethod:
 
     Args:
         num_candidates: N.
-        num_elites: sequences that the Gaussian is refitted on, 1 to N; fewer where fewer are feasible.
+        num_elites: sequences that the Gaussian is refitted on, 1 to N; ``None`` for a tenth of N, Table 1's fraction. Fewer
+            where fewer are feasible.
         optim_steps: rounds, each scored. Table 1's n_cem_iters = 5 samples five iterations and scores four.
         p_random: fraction of uniform candidates in the first round, in [0, 1].
         p_constant: fraction of candidates in the first round that hold one uniform action over the whole horizon.
@@ -102,7 +103,7 @@ class CrossEntropyMethod:
         self,
         *,
         num_candidates: int = 1000,
-        num_elites: int = 100,
+        num_elites: int | None = None,
         optim_steps: int = 4,
         p_random: float = 1.0,
         p_constant: float = 0.0,
@@ -115,7 +116,7 @@ class CrossEntropyMethod:
             p_constant=p_constant,
         )
         self.num_candidates = num_candidates
-        self.num_elites = num_elites
+        self.num_elites = max(num_candidates // 10, 1) if num_elites is None else num_elites
         self.optim_steps = optim_steps
         self.p_random = p_random
         self.p_constant = p_constant

@@ -8,7 +8,7 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from ls3_torchrl.options.planner import ConstraintReduction, EngineName, Precision, SafeSetReduction
+from ls3_torchrl.options.planner import EngineName, Precision, SafeSetReduction
 from ls3_torchrl.planners.fusable import require_fusable, why_not_fused
 from ls3_torchrl.planners.fused import FusedImagination
 from ls3_torchrl.planners.imagination import Imagination, RolloutImagination
@@ -26,7 +26,6 @@ class Engine:
         safe_set: f_S.
         name: ``"fused"``, ``"rollout"``, or ``"auto"`` for the first wherever it bypasses no module.
         precision: of the fused one.
-        constraint_reduction: over particles, ``"max"`` or ``"mean"``.
         safe_set_reduction: over particles, ``"mean"`` or ``"min"``.
 
     Raises:
@@ -42,13 +41,11 @@ class Engine:
         name: EngineName = "auto",
         *,
         precision: Precision = "auto",
-        constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
     ) -> None:
         self.name: EngineName = name
         self._precision: Precision = precision
         self._reductions: dict[str, Any] = {
-            "constraint_reduction": constraint_reduction,
             "safe_set_reduction": safe_set_reduction,
         }
         self._take(env, value, safe_set)

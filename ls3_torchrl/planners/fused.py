@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from ls3_torchrl._checks import require_choice
 from ls3_torchrl.layers import run_layers, run_stacked
-from ls3_torchrl.options.planner import ConstraintReduction, Precision, SafeSetReduction
+from ls3_torchrl.options.planner import Precision, SafeSetReduction
 from ls3_torchrl.planners.forked import HelperError, Helpers, may_fork
 from ls3_torchrl.planners.fusable import require_fusable, why_not_fused
 from ls3_torchrl.planners.imagination import ImaginationNoise, Limits
@@ -85,7 +85,6 @@ class FusedImagination:
             none of the methods whose work is done here.
         value: V, likewise.
         safe_set: f_S, likewise.
-        constraint_reduction: over particles, ``"max"`` or ``"mean"``.
         safe_set_reduction: over particles, ``"mean"`` or ``"min"``.
         precision: ``"fp32"``, ``"bf16"``, or ``"auto"`` for what a short measurement finds faster here.
         block: particles that are carried together; by default what stays in a CPU's cache, or what fills a
@@ -105,7 +104,6 @@ class FusedImagination:
         value: TensorDictModuleBase,
         safe_set: TensorDictModuleBase,
         *,
-        constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
         precision: Precision = "auto",
         block: int | None = None,
@@ -114,7 +112,6 @@ class FusedImagination:
         require_choice(precision, ("auto", "fp32", "bf16"), "precision")
         require_fusable(env, value, safe_set)
         self.env, self.value, self.safe_set = env, value, safe_set
-        self.constraint_reduction = constraint_reduction
         self.safe_set_reduction = safe_set_reduction
         self.precision = precision
         self.block = block
@@ -244,7 +241,7 @@ class FusedImagination:
 
     def _helpers_for(self, workers: int) -> Helpers | None:
         """Processes that have this snapshot, where they pay."""
-        reduced_by = self.constraint_reduction, self.safe_set_reduction, self.block
+        reduced_by = self.safe_set_reduction, self.block
         if self._helpers is not None and not self._helpers.are_mine:
             self._helpers, self._calls = None, 0
         if self._helpers is not None and (len(self._helpers) != workers - 1 or reduced_by != self._reduced_by):
@@ -281,7 +278,7 @@ class FusedImagination:
         horizon, r, _ = plan.shape
         path = unroll(self.env.dynamics, self._snapshot, latent, row_of, plan, members, groups, noise)
         violating = self._probability("constraint", path)
-        constraint = violating.amax(1) if self.constraint_reduction == "max" else violating.mean(1)
+        constraint = violating.amax(1)
         in_safe_set = self._probability("safe_set", path[-1])
         safe = in_safe_set.amin(0) if self.safe_set_reduction == "min" else in_safe_set.mean(0)
 

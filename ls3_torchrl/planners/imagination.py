@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ls3_torchrl.modules.call import call_on_latent
 from ls3_torchrl.modules.classifiers import probability_of
-from ls3_torchrl.options.planner import ConstraintReduction, SafeSetReduction
+from ls3_torchrl.options.planner import SafeSetReduction
 from ls3_torchrl.planners.latent_env import LatentEnv
 from ls3_torchrl.planners.scoring import PlanStatistics
 
@@ -113,7 +113,6 @@ class RolloutImagination:
         env: the learned model.
         value: V; a module of a latent that writes the members' values ``[*B, M, 1]``, or one value ``[*B, 1]``.
         safe_set: f_S; a module of a latent whose first output is a logit ``[*B, 1]``.
-        constraint_reduction: over particles, ``"max"`` (the authors') or ``"mean"``.
         safe_set_reduction: over particles, ``"mean"`` (the authors') or ``"min"``.
 
     Example:
@@ -133,11 +132,9 @@ class RolloutImagination:
         value: TensorDictModuleBase,
         safe_set: TensorDictModuleBase,
         *,
-        constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
     ) -> None:
         self.env, self.value, self.safe_set = env, value, safe_set
-        self.constraint_reduction = constraint_reduction
         self.safe_set_reduction = safe_set_reduction
 
     def parameters_fixed(self) -> AbstractContextManager[None]:
@@ -161,7 +158,7 @@ class RolloutImagination:
         return PlanStatistics(
             value=value.mean(2).float(),
             goal_prob=goal.mean(2).float(),
-            constraint_prob=(constraint.amax(2) if self.constraint_reduction == "max" else constraint.mean(2)).float(),
+            constraint_prob=constraint.amax(2).float(),
             safe_set_prob=(safe.amin(2) if self.safe_set_reduction == "min" else safe.mean(2)).float(),
         )
 

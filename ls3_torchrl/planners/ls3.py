@@ -19,7 +19,6 @@ from ls3_torchrl._checks import (
 )
 from ls3_torchrl.modules.call import call_on_latent, posterior_keys
 from ls3_torchrl.options.planner import (
-    ConstraintReduction,
     ControlOptions,
     EngineName,
     GoalReduction,
@@ -83,7 +82,6 @@ class LS3Planner(MPCPlannerBase):
         constraint_threshold: δ_C, likewise; ``None`` for plans whatever they violate.
         relaxation: factor on δ_S when no plan ends in the safe set, strictly between 0 and 1.
         max_relaxations: how often δ_S may be relaxed in one plan.
-        constraint_reduction: over particles, ``"max"`` as the authors' code or ``"mean"``.
         safe_set_reduction: over particles, ``"mean"`` as the authors' code or ``"min"``: every particle must end
             in the safe set. A mean of δ_S lets a fraction 1 − δ_S of the particles end anywhere, and a plan gains from
             sending them where the value is overestimated.
@@ -148,7 +146,6 @@ class LS3Planner(MPCPlannerBase):
         constraint_threshold: float | None = 0.2,
         relaxation: float = 0.8,
         max_relaxations: int = 5,
-        constraint_reduction: ConstraintReduction = "max",
         safe_set_reduction: SafeSetReduction = "mean",
         goal_reduction: GoalReduction = "count",
         pessimism: float = 0.0,
@@ -171,7 +168,6 @@ class LS3Planner(MPCPlannerBase):
             constraint_threshold=constraint_threshold,
             relaxation=relaxation,
             max_relaxations=max_relaxations,
-            constraint_reduction=constraint_reduction,
             safe_set_reduction=safe_set_reduction,
             goal_reduction=goal_reduction,
             pessimism=pessimism,
@@ -192,7 +188,6 @@ class LS3Planner(MPCPlannerBase):
             safe_set,
             engine,
             precision=precision,
-            constraint_reduction=constraint_reduction,
             safe_set_reduction=safe_set_reduction,
         )
 

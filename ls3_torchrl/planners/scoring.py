@@ -17,7 +17,7 @@ class PlanStatistics(NamedTuple):
     Attributes:
         value: mean over particles of every member's V(z_H), ``[*B, N, M]``.
         goal_prob: mean probability of the goal at each step, ``[*B, N, H]``.
-        constraint_prob: largest (or mean) probability of a violation at each step, ``[*B, N, H]``.
+        constraint_prob: largest probability over particles of a violation at each step, ``[*B, N, H]``.
         safe_set_prob: mean (or smallest) probability that z_H lies in the safe set, ``[*B, N]``.
     """
 

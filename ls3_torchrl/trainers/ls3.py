@@ -127,8 +127,9 @@ class LS3Trainer:
         members = _members_of(dynamics)
         loss = EnsembleDynamicsLoss(dynamics, bootstrap=members is not None, steps=horizon)
         loss.set_keys(action=self.buffer.keys.action)
-        without = None if self.buffer.dynamics_after_violation else "after_violation"
-        batches = self._batches(loss, members, without=without, steps=horizon if horizon > 1 else None)
+        # What follows a violation is frozen in many worlds, and no plan is to go through one.
+        rows = {"without": "after_violation", "steps": horizon if horizon > 1 else None}
+        batches = self._batches(loss, members, **rows)
         return Learner("dynamics", loss, batches, lr=options.optim.dynamics_lr, **self._how)
 
     def _value_learner(self) -> Learner:

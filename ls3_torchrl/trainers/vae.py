@@ -216,9 +216,8 @@ class VAETrainer:
             batch = self.buffer.sample_frames(options.batch_size)
         else:
             steps = options.prediction_horizon
-            left_out = None if self.buffer.dynamics_after_violation else "after_violation"
             batch = self.buffer.sample_frame_transitions(
-                options.batch_size, without=left_out, steps=steps if steps > 1 else None
+                options.batch_size, without="after_violation", steps=steps if steps > 1 else None
             )
         batch = batch.to(self.device)
         images = batch.get(self.buffer.keys.observation)

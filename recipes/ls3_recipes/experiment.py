@@ -214,8 +214,8 @@ class Experiment:
         return figures
 
     def select(self) -> None:
-        """Keep the agent: the last one, or the one whose episodes went best."""
-        if self.settings.online.select == "best" and self.online:
+        """Keep the agent whose online episodes went best: fewest violations, then the highest return."""
+        if self.online:
             # An agent that acted, and is known by its episodes; the last one never did.
             best = best_update(self.online)
             self.algorithm.restore(self.folder.agent(best))

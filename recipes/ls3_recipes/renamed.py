@@ -16,7 +16,6 @@ RENAMED = {
     "loss.gamma": "buffer.gamma",
     "loss.success_tail": "buffer.success_tail",
     "loss.continue_failures": "buffer.continue_failures",
-    "loss.frozen_dynamics": "buffer.dynamics_after_violation",
     "loss.undecided_weight": "loss.timed_out_weight",
     "online.share": "online.fraction",
     "task.buffer_capacity": "buffer.capacity",
@@ -34,6 +33,10 @@ REMOVED: dict[str, Any] = {
     "agent.propagation": "ts1",
     "planner.common_noise": True,
     "planner.min_std": 0.0,
+    "planner.constraint_reduction": "max",
+    "buffer.dynamics_after_violation": False,
+    "loss.frozen_dynamics": False,
+    "online.select": "best",
     "policy.learn_alpha": False,
     "policy.zero_at_goal": False,
 }
@@ -123,7 +126,7 @@ def rename_settings(
 
 
 def _drop_removed(settings: dict[str, Any], *, trained: bool) -> None:
-    """Leave out what is gone. What a trained agent learnt with does not matter to what it does now."""
+    """Leave out what is gone; where an agent was trained with it, say so, otherwise refuse."""
     for old, only in REMOVED.items():
         section, name = old.split(".")
         values = settings.get(section)
@@ -132,9 +135,12 @@ def _drop_removed(settings: dict[str, Any], *, trained: bool) -> None:
         value = values.pop(name)
         if value == only:
             continue
-        if not trained or section in ("agent", "planner"):
+        if not trained:
             raise ValueError(f"{removed(old)} Got {value!r}.")
-        warnings.warn(f"This run was trained with {old} = {value!r}, a setting that is gone.", stacklevel=4)
+        warnings.warn(
+            f"This run had {old} = {value!r}, a setting that is gone: its agent does now what runs did at {only!r}.",
+            stacklevel=4,
+        )
 
 
 def removed(name: str) -> str:

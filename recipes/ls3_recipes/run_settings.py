@@ -48,18 +48,15 @@ class EpisodeSettings:
     Args:
         updates: rounds of episodes, each followed by an update; 0 for offline training alone.
         episodes_per_update: collected side by side in each round.
-        select: ``agent.pt`` is the last agent, or the best, by violations and then return of its own online episodes.
     """
 
     updates: int = 25
     episodes_per_update: int = 10
-    select: Literal["last", "best"] = "last"
 
     def __post_init__(self) -> None:
         """Refuse numbers that no run can have."""
         require_at_least(self.updates, 0, "updates")
         require_at_least(self.episodes_per_update, 1, "episodes_per_update")
-        require_choice(self.select, ("last", "best"), "select")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,8 +151,7 @@ class RunSettings:
         agent: sizes of the networks. To a baseline that reads latents, all of them matter: it makes the whole agent, so
             that with the same seed it draws the same random numbers, and the VAE is LS³'s bit for bit.
         vae: equation (1).
-        buffer: what is kept of episodes; ``dynamics_after_violation`` matters to a baseline by the prediction term of
-            the VAE alone.
+        buffer: what is kept of episodes.
         online: how many episodes.
         evaluation: in how many episodes the agent is evaluated.
     """

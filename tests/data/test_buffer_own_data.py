@@ -250,11 +250,3 @@ def test_nothing_is_stored_when_one_of_the_episodes_lacks_a_key():
     with pytest.raises(KeyError, match="hit"):
         buffer.add([episode(3), episode(3).exclude(KEYS.constraint)], "success")
     assert len(buffer) == len(buffer.frames) == 0
-
-
-def test_whether_dynamics_learn_behind_a_violation_is_recorded_alone():
-    buffer = TaggedReplayBuffer(50, latent_dim=2, keys=KEYS, dynamics_after_violation=False)
-    buffer.add(episode(6), "success")
-    assert not buffer.dynamics_after_violation
-    assert len(buffer) == buffer.count() == 6
-    assert TaggedReplayBuffer(5).dynamics_after_violation

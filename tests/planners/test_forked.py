@@ -218,7 +218,7 @@ def test_a_fork_leaves_the_processes_of_its_parent_alone(imagine):
 
 def test_another_reduction_is_seen(imagine):
     first = [imagine(*work()) for _ in range(3)][-1]
-    imagine.constraint_reduction = "mean"
+    imagine.safe_set_reduction = "min"
     changed = [imagine(*work()) for _ in range(3)]
-    assert (changed[0].constraint_prob < first.constraint_prob).all()
+    assert (changed[0].safe_set_prob < first.safe_set_prob).all()
     assert_same(changed[0], changed[2])

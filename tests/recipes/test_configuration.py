@@ -42,7 +42,6 @@ TABLE_1 = {
     "planner.horizon": 5,
     "planner.num_particles": 20,
     "planner.num_candidates": 1000,
-    "planner.num_elites": 100,
     "agent.latent_dim": 32,
     "planner.p_random": 1.0,
     "optim.batch_size": 256,
@@ -117,6 +116,15 @@ def test_the_supplements_settings_of_the_baselines_per_task(task, penalty, gamma
     policy = train_settings("algorithm=sacfd", f"task={task}").policy
     assert (policy.penalty, policy.risk.gamma, policy.risk.threshold, policy.lr) == (penalty, gamma, threshold, 3e-4)
     assert train_settings("algorithm=awac", f"task={task}").policy.penalty == -1
+
+
+@pytest.mark.parametrize(
+    ("task", "elites"), [("navigation", 100), ("reacher", 100), ("pushing", 100), ("cable_routing", 200)]
+)
+def test_the_elites_of_table_1(task, elites):
+    settings = train_settings(f"task={task}", "preset=paper")
+    agent = LS3Agent(action_spec=Bounded(low=-3.0, high=3.0, shape=(2,)), planner=as_dict(settings.planner))
+    assert agent.planner().optimizer.num_elites == elites
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -231,7 +239,7 @@ def test_arguments_that_nothing_reads_are_refused_with_what_makes_them_matter(ot
 
 
 def test_what_matters_to_the_vae_of_a_baseline_can_be_set():
-    overrides = ("vae.steps=5", "agent.num_dynamics=9", "buffer.dynamics_after_violation=false")
+    overrides = ("vae.steps=5", "agent.num_dynamics=9", "buffer.success_tail=7")
     settings = as_dict(train_settings("algorithm=bc", "preset=smoke", *overrides))
     assert (settings["vae"]["steps"], settings["agent"]["num_dynamics"]) == (5, 9)
 
@@ -239,7 +247,7 @@ def test_what_matters_to_the_vae_of_a_baseline_can_be_set():
 def test_files_bring_the_settings_of_all_algorithms_and_each_is_left_its_own():
     settings = as_dict(train_settings("algorithm=sacfd", "preset=cpu", "task=pushing"))
     assert not {"planner", "optim", "loss", "offline"} & set(settings)
-    assert set(settings["online"]) == {"updates", "episodes_per_update", "select"}
+    assert set(settings["online"]) == {"updates", "episodes_per_update"}
     assert "continue_failures" not in settings["buffer"]
 
 
@@ -281,7 +289,6 @@ def test_a_file_with_a_setting_that_nobody_has_is_refused(setting, message):
         ("loss.monte_carlo=true", r"^loss\.monte_carlo needs buffer\.continue_failures=true"),
         ("online.updates=-1", r"^online\.updates"),
         ("online.episodes_per_update=0", r"^online\.episodes_per_update"),
-        ("online.select=first", r"^online\.select must be one of 'last', 'best', got 'first'"),
         ("online.fraction=1.0", r"^online\.fraction"),
         ("online.dynamics_steps=-1", r"^online\.dynamics_steps"),
         ("evaluation.episodes=0", r"^evaluation\.episodes"),
@@ -315,7 +322,6 @@ def test_impossible_settings_are_refused_by_their_full_names(override, message):
         ("awac", "policy.temperature=0"),
         ("awac", "policy.updates_per_step=-1"),
         ("awac", "policy.critic_steps=-1"),
-        ("awac", "online.select=first"),
     ],
 )
 def test_impossible_settings_of_baselines_are_refused_by_their_full_names(algorithm, override):

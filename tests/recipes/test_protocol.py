@@ -194,18 +194,17 @@ def test_the_seed_decides_a_run(no_probe, tmp_path):
     assert not all(torch.equal(one[2][name], other[2][name]) for name in one[2])
 
 
-@pytest.mark.parametrize("select", ["last", "best"])
-def test_the_agent_that_is_kept_is_the_one_that_was_selected(no_probe, monkeypatch, tmp_path, select):
+def test_the_agent_that_is_kept_is_the_one_whose_episodes_went_best(no_probe, monkeypatch, tmp_path):
     monkeypatch.setattr(experiment, "best_update", lambda online: 1)
-    run_experiment(settings(f"online.select={select}", "pictures=false", f"output={tmp_path / 'run'}"))
+    run_experiment(settings("pictures=false", f"output={tmp_path / 'run'}"))
     kept = LS3Agent.load(tmp_path / "run" / "agent.pt").state_dict()
     agents = [LS3Agent.load(path).state_dict() for path in sorted((tmp_path / "run" / "checkpoints").glob("*.pt"))]
     same = [all(torch.equal(kept[key], agent[key]) for key in kept) for agent in agents]
-    assert same == ([False, True, False] if select == "best" else [False, False, True])
+    assert same == [False, True, False]
 
 
 def test_without_updates_there_are_no_online_episodes_and_nothing_is_selected(no_probe, tmp_path):
-    run = settings("online.updates=0", "online.select=best", "pictures=false", f"output={tmp_path / 'run'}")
+    run = settings("online.updates=0", "pictures=false", f"output={tmp_path / 'run'}")
     summary = run_experiment(run)
     assert "online" not in summary
     assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["agent_000.pt"]

@@ -31,7 +31,6 @@ WHOLE = {
             "optim.target_interval",
             "planner.horizon",
             "planner.num_candidates",
-            "planner.num_elites",
             "planner.num_particles",
             "planner.optim_steps",
             "policy.batch_size",
@@ -60,7 +59,8 @@ WHOLE = {
     ),
 }
 WHOLE_OR_NULL = dict.fromkeys(
-    ["buffer.success_tail", "task.horizon", "task.offline_episodes", "threads", "vae.enlarge_to"], 1
+    ["buffer.success_tail", "planner.num_elites", "task.horizon", "task.offline_episodes", "threads", "vae.enlarge_to"],
+    1,
 )
 NUMBERS = {
     **dict.fromkeys(
@@ -113,7 +113,6 @@ FLAGS = {
     "agent.background",
     "agent.control_affine",
     "buffer.continue_failures",
-    "buffer.dynamics_after_violation",
     "loss.monte_carlo",
     "loss.zero_at_goal",
     "pictures",
@@ -123,9 +122,7 @@ FLAGS = {
 WORDS = {
     "encoder": ("latents", "conv"),
     "loss.failure_rows": ("all", "violating"),
-    "online.select": ("last", "best"),
     "optim.autocast": (True, False, "auto"),
-    "planner.constraint_reduction": ("max", "mean"),
     "planner.engine": ("auto", "fused", "rollout"),
     "planner.goal_reduction": ("count", "expected"),
     "planner.precision": ("auto", "fp32", "bf16"),

@@ -104,12 +104,9 @@ def _plans(work: Workbench, figure: str) -> dict[str, Maker]:
     torch.manual_seed(0)
     agent = permissive(LS3Agent(action_spec=work.spec, **as_dict(preset.agent))).to(work.device)
     options = as_dict(preset.planner)
-    elites = options["num_elites"] / options["num_candidates"]
 
     def make(size: int) -> Callable[[], object]:
         changes = {_OPTIONS[figure]: size} if figure in _OPTIONS else {}
-        if figure == "candidates":
-            changes["num_elites"] = max(round(elites * size), 1)
         planner = agent.planner(work.spec, **(options | changes))
         worlds = size if figure == "worlds" else 1
         latent = torch.randn(worlds, agent.architecture.latent_dim, device=work.device)
