@@ -351,8 +351,8 @@ def _drop_removed(path: Path, content: dict[str, Any]) -> None:
             value = values.pop(name, only)
             if value != only:
                 warnings.warn(
-                    f"{path} holds an agent with {name}={value!r}. That setting is gone: it plans now as at {only!r}. For "
-                    "the plans of before, install the library version that wrote it.",
+                    f"{path} holds an agent with {name}={value!r}. That setting is gone: it plans now as at {only!r}. "
+                    "For the plans of before, install the library version that wrote it.",
                     stacklevel=4,
                 )
 

@@ -76,8 +76,8 @@ class CrossEntropyMethod:
 
     Args:
         num_candidates: N.
-        num_elites: sequences that the Gaussian is refitted on, 1 to N; ``None`` for a tenth of N, Table 1's fraction. Fewer
-            where fewer are feasible.
+        num_elites: sequences that the Gaussian is refitted on, 1 to N; ``None`` for a tenth of N, as in
+            Table 1. Fewer where fewer are feasible.
         optim_steps: rounds, each scored. Table 1's n_cem_iters = 5 samples five iterations and scores four.
         p_random: fraction of uniform candidates in the first round, in [0, 1].
         p_constant: fraction of candidates in the first round that hold one uniform action over the whole horizon.

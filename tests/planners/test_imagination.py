@@ -1,6 +1,5 @@
 import itertools
 
-import pytest
 import torch
 from torchrl.data import Bounded
 
