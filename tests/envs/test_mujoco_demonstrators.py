@@ -5,6 +5,7 @@ import torch
 
 from ls3_envs import collect_offline
 from ls3_envs.pushing import block_positions
+from ls3_envs.reacher import OBSTACLE, OBSTACLE_RADIUS, finger_position
 
 
 def rates(name: str, kind: str, episodes: int) -> tuple[float, float, torch.Tensor]:
@@ -29,6 +30,12 @@ def test_demonstrations_succeed_violate_nothing_and_leave_room(name, least, hori
 @pytest.mark.parametrize("name", ["reacher", "pushing", "cable_routing"])
 def test_violating_data_violate_in_most_trajectories(name):
     assert rates(name, "constraint", 30)[1] >= 0.6
+
+
+def test_reachers_demonstrations_keep_two_pixels_from_the_disc():
+    data = collect_offline("reacher", "success", episodes=20, seed=0)
+    distance = (finger_position(data["next", "state"]) - torch.tensor(OBSTACLE)).norm(dim=-1)
+    assert distance.min() > OBSTACLE_RADIUS + 0.02
 
 
 def test_wandering_torques_stay_in_the_box_and_wander():

@@ -8,11 +8,14 @@ import torch
 from torch import Tensor
 
 from ls3_envs.demonstrators.scripted import Scripted
-from ls3_envs.reacher import LINK, OBSTACLE
+from ls3_envs.reacher import LINK, OBSTACLE, START
 
 
 class ReacherDemonstrator(Scripted):
     """A proportional controller: stretch the arm to the left, below the disc, then raise it to the goal.
+
+    The shoulder turns first, so that the finger leaves the disc behind before the elbow opens: with both at once it
+    would pass at a pixel's distance, too near for anything learnt from pictures to know on which side it is.
 
     Args:
         noise_std: standard deviation of the noise on the torques.
@@ -32,7 +35,8 @@ class ReacherDemonstrator(Scripted):
 
     def _act(self, state: Tensor, step: Tensor, is_init: Tensor) -> Tensor:
         shoulder = torch.where(step < 40, math.pi, 0.75 * math.pi)
-        target = torch.cat([shoulder, torch.zeros_like(shoulder)], -1)
+        elbow = torch.where(step < 5, START[1], 0.0)
+        target = torch.cat([shoulder, elbow], -1)
         return (target - state[:, :2]).clamp(-1.0, 1.0)
 
 
