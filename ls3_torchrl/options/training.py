@@ -90,9 +90,10 @@ class VAEOptions:
         warmup: fractions [start, end] of the steps between which β and ``prediction_weight`` rise from 0; ``None``
             for none. With few latents and a large β a small moving object is otherwise never drawn.
         prediction_weight: weight, at least 0, of :class:`~ls3_torchrl.objectives.LatentPredictionLoss`: dynamics that
-            are trained along must predict the next latent. 0 is the paper.
+            are trained along must predict the next latent. The trained latents are then measured in units of their own
+            spread, which this term leaves open, where encoder and decoder have a method ``rescale(factor)``. 0 is the
+            paper.
         prediction_horizon: steps from the image that is predicted from to the one that is predicted, at least 1.
-        unit_scale: measure the trained latents in units of their own spread.
         enlarge_to: images of a dataset enlarged by random shifts and perspectives, from which batches seem drawn
             (section 1.3.4); ``None`` for the images as they are.
         autocast: bf16 autocast; ``"auto"`` where a short measurement finds it faster.
@@ -115,7 +116,6 @@ class VAEOptions:
     warmup: tuple[float, float] | None = None
     prediction_weight: float = 0.0
     prediction_horizon: int = 1
-    unit_scale: bool = False
     enlarge_to: int | None = None
     autocast: Autocast = "auto"
 
@@ -131,7 +131,6 @@ class VAEOptions:
         if self.enlarge_to is not None:
             _require_count(self.enlarge_to, 1, "enlarge_to")
         _require_above_zero(self.lr, "lr")
-        _require_flags(self, "unit_scale")
         require_choice(self.schedule, ("constant", "onecycle"), "schedule")
         _require_not_negative(self.beta, "beta")
         _require_not_negative(self.prediction_weight, "prediction_weight")

@@ -85,12 +85,6 @@ class VAETrainer:
                 "VAETrainer needs an agent with an encoder and a decoder. An encoder that is trained already needs no "
                 "VAETrainer: call buffer.encode(agent.encoder)."
             )
-        rescales = all(hasattr(half, "rescale") for half in (agent.encoder, agent.decoder))
-        if options.unit_scale and not rescales:
-            raise ValueError(
-                "unit_scale needs an encoder and a decoder with a method rescale(factor), as PixelEncoder and "
-                "PixelDecoder have. Pass unit_scale=False for others."
-            )
         self.steps = 0
         self._error = 0.0  # of reconstruction, as it was last logged
         self._checked = self._rescaled = False
@@ -134,18 +128,25 @@ class VAETrainer:
                 self._warn_of_collapse(self._error)
             self._checked = True
         self.encode()
-        if self.options.unit_scale and self.options.checkpoint is None and not self._rescaled:
-            spread = float(self.buffer.transitions.storage[:]["loc"].std(0).square().mean().sqrt())
-            if not spread > 0.0:
-                raise ValueError(
-                    "All latents are alike, and have no spread to be divided by. Look at the images, or pass "
-                    "VAEOptions(unit_scale=False)."
-                )
-            self.agent.encoder.rescale(1.0 / spread)
-            self.agent.decoder.rescale(1.0 / spread)
-            self._rescaled = True
-            self.encode()
+        if self.prediction is not None and self.options.checkpoint is None and not self._rescaled:
+            self._rescale()
         self.finished = True
+
+    def _rescale(self) -> None:
+        """Measure the latents in units of their own spread; the prediction term leaves their scale open."""
+        halves = self.agent.encoder, self.agent.decoder
+        self._rescaled = True
+        if not all(hasattr(half, "rescale") for half in halves):
+            return
+        spread = float(self.buffer.transitions.storage[:]["loc"].std(0).square().mean().sqrt())
+        if not spread > 0.0:
+            raise ValueError(
+                "All latents are alike, and have no spread to be divided by. Look at the images: do they show anything "
+                "that moves?"
+            )
+        for half in halves:
+            half.rescale(1.0 / spread)
+        self.encode()
 
     def encode(self) -> None:
         """Freeze encoder and decoder, and encode every frame of the buffer."""

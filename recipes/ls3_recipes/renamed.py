@@ -37,6 +37,7 @@ REMOVED: dict[str, Any] = {
     "buffer.dynamics_after_violation": False,
     "loss.frozen_dynamics": False,
     "online.select": "best",
+    "vae.unit_scale": True,
     "policy.learn_alpha": False,
     "policy.zero_at_goal": False,
 }

@@ -117,7 +117,6 @@ FLAGS = {
     "loss.zero_at_goal",
     "pictures",
     "recovery",
-    "vae.unit_scale",
 }
 WORDS = {
     "encoder": ("latents", "conv"),

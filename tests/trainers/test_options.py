@@ -58,7 +58,6 @@ def test_values_out_of_range_are_refused_by_name(options, field, value):
         (VAEOptions, "lr", "fast"),
         (VAEOptions, "lr", None),
         (VAEOptions, "beta", "small"),
-        (VAEOptions, "unit_scale", "maybe"),
         (VAEOptions, "warmup", "early"),
         (VAEOptions, "warmup", ["a", "b"]),
         (VAEOptions, "checkpoint", 3),

@@ -56,7 +56,7 @@ def counts(settings: LS3Settings, horizon: int, frames: Mapping[str, float]) -> 
     played = online.updates * online.episodes_per_update
     out: dict[Step, int] = {("data", f"{kind} episode"): count for kind, count in episodes.items()}
     out["VAE", "VAE step"] = vae.steps if trained else 0
-    passes = 2 if trained and vae.unit_scale else 1  # the frames are encoded again in the latents' own units
+    passes = 2 if trained and vae.prediction_weight else 1  # the frames are encoded again in the latents' own units
     out["VAE", "frame encoded"] = passes * round(sum(count * frames[kind] for kind, count in episodes.items()))
     for name, option in _LEARNERS.items():
         if hasattr(settings.offline, option):
