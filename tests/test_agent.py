@@ -243,7 +243,7 @@ def test_a_file_of_version_one_is_read_with_a_warning(tmp_path):
 
 GONE = {
     "architecture": {"propagation": "ts1"},
-    "planner": {"common_noise": True, "constraint_reduction": "max", "min_std": 0.0},
+    "planner": {"common_noise": True, "constraint_reduction": "max", "goal_reduction": "count", "min_std": 0.0},
 }
 
 

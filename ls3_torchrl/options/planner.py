@@ -7,7 +7,6 @@ from typing import Literal
 
 from ls3_torchrl._values import require_at_least, require_choice, require_not_negative, require_probability
 
-GoalReduction = Literal["count", "expected"]
 SafeSetReduction = Literal["mean", "min"]
 EngineName = Literal["auto", "fused", "rollout"]
 Precision = Literal["auto", "fp32", "bf16"]
@@ -32,7 +31,6 @@ class ControlOptions:
     relaxation: float = 0.8
     max_relaxations: int = 5
     safe_set_reduction: SafeSetReduction = "mean"
-    goal_reduction: GoalReduction = "count"
     pessimism: float = 0.0
     noise_scale: float = 1.0
     engine: EngineName = "auto"
@@ -46,7 +44,6 @@ class ControlOptions:
             if getattr(self, name) is not None:
                 require_probability(getattr(self, name), name)
         require_at_least(self.max_relaxations, 0, "max_relaxations")
-        require_choice(self.goal_reduction, ("count", "expected"), "goal_reduction")
         for name in ("pessimism", "noise_scale"):
             require_not_negative(getattr(self, name), name)
         require_choice(self.engine, ("auto", "fused", "rollout"), "engine")

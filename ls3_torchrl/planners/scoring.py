@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ls3_torchrl.options.planner import GoalReduction
 from ls3_torchrl.planners.optimizer import PlanScores
 
 
@@ -27,23 +26,20 @@ class PlanStatistics(NamedTuple):
     safe_set_prob: Tensor
 
 
-def objective(statistics: PlanStatistics, *, pessimism: float = 0.0, goal_reduction: GoalReduction = "count") -> Tensor:
+def objective(statistics: PlanStatistics, *, pessimism: float = 0.0) -> Tensor:
     """Mean of V(z_H) over particles and members + imagined steps in the goal, ``[*B, N]``.
 
     Counting steps in the goal (mean goal probability above one half) equals summing the rewards −1 and 0 up
-    to the constant H; summing the probabilities equals the expectation of that sum, and tells the middle of the goal
-    from its doubtful edge.
+    to the constant H.
 
     Args:
         statistics: of the candidates.
-        goal_reduction: over steps, ``"count"`` as the authors' code, or ``"expected"``.
         pessimism: κ ≥ 0, subtracts κ standard deviations over members; 0 is the paper.
     """
     value = statistics.value.mean(-1)
     if pessimism > 0.0:
         value = value - pessimism * statistics.value.std(-1, correction=0)
-    in_goal = statistics.goal_prob if goal_reduction == "expected" else statistics.goal_prob > 0.5
-    return value + in_goal.sum(-1)
+    return value + (statistics.goal_prob > 0.5).sum(-1)
 
 
 def feasible(statistics: PlanStatistics, *, safe_set_threshold: Tensor | float, constraint_threshold: float) -> Tensor:

@@ -38,6 +38,7 @@ REMOVED: dict[str, Any] = {
     "loss.frozen_dynamics": False,
     "online.select": "best",
     "vae.unit_scale": True,
+    "planner.goal_reduction": "count",
     "policy.learn_alpha": False,
     "policy.zero_at_goal": False,
 }

@@ -440,7 +440,6 @@ def test_probabilities_must_lie_strictly_between_zero_and_one(name, value):
         ({"p_random": 1.5}, r"p_random must lie in \[0, 1\]"),
         ({"pessimism": -1.0}, "pessimism must not be negative"),
         ({"noise_scale": -0.1}, "noise_scale must not be negative, got -0.1"),
-        ({"goal_reduction": "sum"}, "goal_reduction must be one of 'count', 'expected'; got 'sum'"),
         ({"engine": "jax"}, "engine must be one of 'auto', 'fused', 'rollout'; got 'jax'"),
         ({"precision": "fp8"}, "precision must be one of 'auto', 'fp32', 'bf16'; got 'fp8'"),
         ({"safe_set_reduction": "max"}, "safe_set_reduction must be one of 'mean', 'min'; got 'max'"),

@@ -26,14 +26,6 @@ def test_counting_goal_steps_equals_summing_rewards_up_to_the_horizon():
     assert torch.equal(objective(plans) - 4, rewards)
 
 
-def test_the_expected_reward_sums_probabilities():
-    plans = statistics(
-        value=[[-10.0, -20.0], [1.0, 3.0], [0.0, 0.0]],
-        goal=[[0.5, 0.75, 1.0], [0.5, 0.5, 0.5], [0.0, 0.0, 0.25]],
-    )
-    assert objective(plans, goal_reduction="expected").tolist() == [-12.75, 3.5, 0.25]
-
-
 def test_pessimism_subtracts_standard_deviations_over_members():
     # Members 1 and 5: mean 3, iteration deviation 2. Members that agree lose nothing.
     plans = statistics(value=[[1.0, 5.0], [2.5, 2.5]])

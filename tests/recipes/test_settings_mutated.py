@@ -123,7 +123,6 @@ WORDS = {
     "loss.failure_rows": ("all", "violating"),
     "optim.autocast": (True, False, "auto"),
     "planner.engine": ("auto", "fused", "rollout"),
-    "planner.goal_reduction": ("count", "expected"),
     "planner.precision": ("auto", "fp32", "bf16"),
     "planner.safe_set_reduction": ("mean", "min"),
     "tracker": ("wandb",),
