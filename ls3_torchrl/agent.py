@@ -173,7 +173,6 @@ class LS3Agent(nn.Module):
             shape.latent_dim,
             num_members=shape.num_values,
             hidden=shape.value_hidden,
-            initial_value=shape.initial_value,
         )
 
     def planner(
@@ -347,6 +346,7 @@ def _drop_removed(path: Path, content: dict[str, Any]) -> None:
         values = content.get(group)
         if not isinstance(values, dict):
             continue
+        values.pop("initial_value", None)  # of the value networks, whose weights are known
         for name, only in removed.items():
             value = values.pop(name, only)
             if value != only:

@@ -284,7 +284,7 @@ def test_a_file_whose_agent_planned_otherwise_with_a_setting_that_is_gone_is_rea
         {"action_scale": np.float64(3.0)},
         {"latent_dim": np.int64(4)},
         {"value_hidden": np.array([8, 8])},
-        {"initial_value": torch.tensor(-3.0)},
+        {"num_values": torch.tensor(2)},
     ],
 )
 def test_numbers_of_numpy_and_torch_can_be_saved_and_read(tmp_path, numbers):

@@ -211,7 +211,7 @@ def test_a_whole_agent_of_another_precision_keeps_it(tmp_path, dtype):
 @pytest.mark.parametrize(
     "sizes",
     [
-        {"latent_dim": np.int64(3), "num_values": np.array(2), "initial_value": np.float32(-1.5)},
+        {"latent_dim": np.int64(3), "num_values": np.array(2), "action_scale": np.float32(1.5)},
         {"latent_dim": torch.tensor(3), "action_scale": torch.tensor([2.0]), "control_affine": np.bool_(True)},
         {"action_scale": np.float64(0.5), "value_hidden": np.array([4, 4]), "background": np.bool_(False)},
         {"dynamics_hidden": [np.int32(4)], "classifier_hidden": torch.tensor([4])},

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -20,9 +19,6 @@ class ValueEnsemble(TensorDictModuleBase):
         latent_dim: D.
         num_members: M.
         hidden: sizes of the hidden layers.
-        initial_value: where the outputs' biases start, in units of reward. Far from all data a network tends to its
-            bias, so that a value of failure, such as −1 / (1 − γ) for a reward of −1 a step, keeps the planner from
-            states that nobody has seen. 0 is the common initialisation.
         latent_key: latent ``[*B, D]``, or ``[*B, M, D]`` with ``per_member=True`` in the call.
         value_key: where the members' values ``[*B, M, 1]`` are written, in units of reward.
 
@@ -44,7 +40,6 @@ class ValueEnsemble(TensorDictModuleBase):
         *,
         num_members: int = 5,
         hidden: Sequence[int] = (256, 256, 256),
-        initial_value: float = 0.0,
         latent_key: NestedKey = "latent",
         value_key: NestedKey = "state_value",
     ) -> None:
@@ -53,8 +48,6 @@ class ValueEnsemble(TensorDictModuleBase):
         self.in_keys = [latent_key]
         self.out_keys = [value_key]
         self.network = EnsembleMLP(latent_dim, 1, num_members=num_members, hidden=hidden)
-        with torch.no_grad():
-            self.network.biases[-1].add_(initial_value)
 
     def forward(self, tensordict: TensorDictBase, *, per_member: bool = False) -> TensorDictBase:
         """Write every member's value of the latent."""

@@ -23,7 +23,6 @@ class AgentArchitecture:
         dynamics_hidden: hidden layers of f_dyn.
         value_hidden: hidden layers of V.
         classifier_hidden: hidden layers of f_S, f_C and f_G.
-        initial_value: where the value networks' output biases start.
         control_affine: the dynamics' change of the latent is affine in the action.
         action_scale: unit of the actions in the dynamics, one number or one for each of A. :class:`LS3Agent` also takes
             ``"box"``, half the range of the actions.
@@ -41,7 +40,6 @@ class AgentArchitecture:
     dynamics_hidden: tuple[int, ...] = (128, 128)
     value_hidden: tuple[int, ...] = (256, 256, 256)
     classifier_hidden: tuple[int, ...] = (256, 256, 256)
-    initial_value: float = 0.0
     control_affine: bool = False
     action_scale: float | tuple[float, ...] = 1.0
     background: bool = False

@@ -192,7 +192,6 @@ class OptimOptions:
         dynamics_lr: learning rate of the dynamics, above 0.
         target_interval: gradient steps between copies to the lagged networks of equations (4) and (5), at least 1.
         autocast: bf16 autocast; ``"auto"`` where a short measurement finds it faster.
-        cooldown: fraction of every phase's steps, at its end, over which the learning rate falls linearly to 0.
     """
 
     batch_size: int = 256
@@ -200,7 +199,6 @@ class OptimOptions:
     dynamics_lr: float = 1e-3
     target_interval: int = 100
     autocast: Autocast = "auto"
-    cooldown: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "target_interval"):
@@ -208,7 +206,6 @@ class OptimOptions:
         for name in ("lr", "dynamics_lr"):
             _require_above_zero(getattr(self, name), name)
         _require_autocast(self.autocast)
-        _require_fraction(self.cooldown, "cooldown")
 
 
 @dataclass(frozen=True)
@@ -220,10 +217,6 @@ class LossOptions:
         zero_at_goal: the target of equation (4) is 0 where the reward is 0, as in the authors' code.
         monte_carlo: targets of equation (4) are at least the return that was seen
             (:class:`~ls3_torchrl.objectives.TD1ValueLoss`); needs a buffer with ``continue_failures``.
-        failure_weight: weight, at least 0, of a term added to equation (3) that pulls the values of the violating
-            demonstrations to ``failure_value``. 0 is the paper.
-        failure_rows: whose values: ``"all"`` states of the violating demonstrations, or those that are ``"violating"``.
-        failure_value: ``None`` for that of an episode without success, −(1 − γ^T) / (1 − γ).
         mean_latents: which of ``"dynamics"``, ``"constraint"`` and ``"goal"`` learn from the posteriors' means instead
             of samples.
         dynamics_horizon: steps over which equation (2) carries each prediction on, at least 1 (the paper: 1).
@@ -234,9 +227,6 @@ class LossOptions:
     gamma_safe_set: float = 0.3
     zero_at_goal: bool = True
     monte_carlo: bool = False
-    failure_weight: float = 0.0
-    failure_rows: Literal["all", "violating"] = "all"
-    failure_value: float | None = None
     mean_latents: tuple[str, ...] = ()
     dynamics_horizon: int = 1
     timed_out_weight: float = 1.0
@@ -244,12 +234,8 @@ class LossOptions:
     def __post_init__(self) -> None:
         _require_fraction(self.gamma_safe_set, "gamma_safe_set")
         _require_flags(self, "zero_at_goal", "monte_carlo")
-        require_choice(self.failure_rows, ("all", "violating"), "failure_rows")
         _require_count(self.dynamics_horizon, 1, "dynamics_horizon")
-        if self.failure_value is not None:
-            _require_number(self.failure_value, "failure_value")
-        for name in ("failure_weight", "timed_out_weight"):
-            _require_not_negative(getattr(self, name), name)
+        _require_not_negative(self.timed_out_weight, "timed_out_weight")
         if isinstance(self.mean_latents, str):
             raise TypeError(f"mean_latents must be a list of names, got {self.mean_latents!r}.")
         unknown = sorted(set(self.mean_latents) - set(MEAN_LATENTS))

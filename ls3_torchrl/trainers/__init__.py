@@ -12,12 +12,11 @@ from ls3_torchrl.options.training import (
 from ls3_torchrl.trainers.checkpoints import Checkpoints, Stateful
 from ls3_torchrl.trainers.diagnostics import StateProbe
 from ls3_torchrl.trainers.group import LearnerGroup, Stage
-from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner
+from ls3_torchrl.trainers.learner import Learner
 from ls3_torchrl.trainers.ls3 import LS3Trainer
 from ls3_torchrl.trainers.vae import VAETrainer
 
 __all__ = [
-    "AuxiliaryLoss",
     "Checkpoints",
     "DivergenceError",
     "LS3Options",

@@ -245,7 +245,7 @@ def _callbacks(learners: Iterable[Learner]) -> list[Callable[[], object]]:
 
 def _tensors(learner: Learner) -> set[int]:
     """Marks of what a learner reads or writes that another may as well: its tensors, and PyTorch's random numbers."""
-    tensors = {id(tensor) for loss in learner.losses for tensor in (*loss.parameters(), *loss.buffers())}
+    tensors = {id(tensor) for tensor in (*learner.loss.parameters(), *learner.loss.buffers())}
     return tensors if learner.is_independent else {*tensors, 0}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -19,21 +19,7 @@ from ls3_torchrl.objectives.base import LatentLoss
 from ls3_torchrl.objectives.lagged import LaggedTargetLoss
 from ls3_torchrl.trainers.lagged_targets import LaggedTargets
 from ls3_torchrl.trainers.progress import Bar, progress_bar
-from ls3_torchrl.trainers.steps import LOG_INTERVAL, cooled_down, log_scalars, new_seed, set_gradients, threads
-
-
-class AuxiliaryLoss(NamedTuple):
-    """A second loss on the same network, with batches of its own.
-
-    Attributes:
-        weight: of its value in the sum.
-        loss: the loss module.
-        sample: draws a batch for it.
-    """
-
-    weight: float
-    loss: LossModule
-    sample: Callable[[], TensorDictBase]
+from ls3_torchrl.trainers.steps import LOG_INTERVAL, log_scalars, new_seed, set_gradients, threads
 
 
 class Learner:
@@ -42,15 +28,12 @@ class Learner:
     Args:
         names: the losses ``loss_{name}`` are minimised, in one step if there are several.
         loss: a TorchRL loss module.
-        sample: draws a batch. With a :class:`~ls3_torchrl.data.BatchStream` here and in ``auxiliary``, every phase has
-            a random stream of its own, and a :class:`LearnerGroup` may train it beside others.
+        sample: draws a batch. With a :class:`~ls3_torchrl.data.BatchStream` here, every phase has a random stream of
+            its own, and a :class:`LearnerGroup` may train it beside others.
         lr: Adam's learning rate.
         target_interval: gradient steps between copies to the target network; ``None`` without one.
         tau: fraction of the way that the target network moves at every step instead.
-        auxiliary: a second loss that is added to the first.
         bf16: compute the losses under bf16 autocast; weights, gradients and optimiser stay fp32.
-        cooldown: fraction of a phase's steps, at its end, over which the learning rate falls linearly to nothing: the
-            last few batches then sway what the agent acts by no more than the others.
         logger: one of TorchRL's (:func:`torchrl.record.loggers.get_logger`); gets every scalar as ``phase/name``.
         progress: show progress bars.
         after_step: called after every gradient step. The state that :meth:`state_dict` gives there continues in the
@@ -81,16 +64,13 @@ class Learner:
         lr: float,
         target_interval: int | None = None,
         tau: float | None = None,
-        auxiliary: AuxiliaryLoss | None = None,
         bf16: bool = False,
-        cooldown: float = 0.0,
         logger: Logger | None = None,
         progress: bool = True,
         after_step: Callable[[], object] | None = None,
     ) -> None:
         self.names = [names] if isinstance(names, str) else list(names)
-        self.loss, self.sample, self.auxiliary, self.bf16 = loss, sample, auxiliary, bf16
-        self.lr, self.cooldown = lr, cooldown
+        self.loss, self.sample, self.bf16 = loss, sample, bf16
         self.logger, self.progress, self.after_step = logger, progress, after_step
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         #: ``None`` where there is nothing to train: a constraint that is known, a goal estimator that is frozen.
@@ -106,39 +86,26 @@ class Learner:
     @property
     def streams(self) -> list[BatchStream]:
         """Where its batches come from, as far as these have random streams of their own."""
-        sources = [self.sample, *([] if self.auxiliary is None else [self.auxiliary.sample])]
-        return [source for source in sources if isinstance(source, BatchStream)]
+        return [self.sample] if isinstance(self.sample, BatchStream) else []
 
     @property
     def is_independent(self) -> bool:
         """Whether all its random numbers are its own: batches from streams, and no dropout in its networks."""
-        drops = any(isinstance(module, _DropoutNd) for loss in self.losses for module in loss.modules())
-        return len(self.streams) == len(self.losses) and not drops
+        return bool(self.streams) and not any(isinstance(module, _DropoutNd) for module in self.loss.modules())
 
     @property
     def phase_steps(self) -> int:
         """Steps that were taken of the phase that it is in."""
         return self._phase_steps
 
-    @property
-    def losses(self) -> list[LossModule]:
-        """All of its losses."""
-        return [self.loss, *([] if self.auxiliary is None else [self.auxiliary.loss])]
-
     def compute_loss(self) -> tuple[dict[str, Tensor], Tensor]:
         """What the losses write for a new batch, and the sum that is minimised."""
         rows = self.new_batch()
-        second = None if self.auxiliary is None else self._as_parameters(self.auxiliary.sample())
         with self.autocast():
             losses = _values_of(self.loss, rows)
             value = losses[f"loss_{self.names[0]}"]
             for name in self.names[1:]:
                 value = value + losses[f"loss_{name}"]
-            if self.auxiliary is not None:
-                assert second is not None
-                auxiliary = _values_of(self.auxiliary.loss, second)[f"loss_{self.names[0]}"]
-                losses["auxiliary"] = auxiliary.detach()
-                value = value + self.auxiliary.weight * auxiliary
         return losses, value
 
     def new_batch(self) -> TensorDictBase:
@@ -286,8 +253,6 @@ class Learner:
         assert self.optimizer is not None
         assert self._phase is not None
         steps, phase = self._phase
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.lr * cooled_down(self._phase_steps / steps, self.cooldown)
         self.optimizer.step()
         if self.target is not None:
             self.target.step()

@@ -23,7 +23,7 @@ from ls3_torchrl.objectives.base import LatentLoss
 from ls3_torchrl.options.training import LS3Options
 from ls3_torchrl.trainers.checks import require_actions_of, warn_of_missing_outcomes
 from ls3_torchrl.trainers.group import LearnerGroup, Stage
-from ls3_torchrl.trainers.learner import AuxiliaryLoss, Learner
+from ls3_torchrl.trainers.learner import Learner
 from ls3_torchrl.trainers.steps import wants_bf16
 
 #: The learners in the order in which they are trained.
@@ -38,8 +38,6 @@ class LS3Trainer:
         buffer: filled with the offline data and encoded (:class:`~ls3_torchrl.trainers.VAETrainer`, or
             ``buffer.encode``); its γ is that of equations (3) and (4).
         options: how.
-        episode_length: T, steps of an episode, of which the value of failure is made; the longest in the buffer when
-            ``None``.
         logger: one of TorchRL's; gets every metric as ``phase/name``.
         progress: show progress bars.
         after_step: called after every gradient step; see :class:`~ls3_torchrl.trainers.Learner`.
@@ -73,7 +71,6 @@ class LS3Trainer:
         buffer: TaggedReplayBuffer,
         options: LS3Options | None = None,
         *,
-        episode_length: int | None = None,
         logger: Logger | None = None,
         progress: bool = True,
         after_step: Callable[[], object] | None = None,
@@ -85,8 +82,6 @@ class LS3Trainer:
                 f"The agent's latents have size {agent.architecture.latent_dim}, the buffer's {buffer.latent_dim}. "
                 "Give both the same latent_dim."
             )
-        self.episode_length = episode_length
-        self._failure_value: float | None = None  # made when it is first needed, once a phase
         if options.loss.monte_carlo and not buffer.continue_failures:
             raise ValueError(
                 "LossOptions.monte_carlo needs a buffer with continue_failures=True: otherwise a failure's return "
@@ -95,7 +90,6 @@ class LS3Trainer:
         optim = options.optim
         self._how: dict[str, Any] = {
             "bf16": wants_bf16(optim.autocast, next(agent.parameters()).device),
-            "cooldown": optim.cooldown,
             "logger": logger,
             "progress": progress,
             "after_step": after_step,
@@ -133,17 +127,12 @@ class LS3Trainer:
         return Learner("dynamics", loss, batches, lr=options.optim.dynamics_lr, **self._how)
 
     def _value_learner(self) -> Learner:
-        """Equation (3), and the value of failure where it is asked for."""
+        """Equation (3)."""
         options, value = self.options, self.agent.value
         members = _members_of(value)
-        bootstrap = members is not None
-        auxiliary = None
-        if options.loss.failure_weight > 0.0:
-            term = OfflineValueLoss(value, bootstrap=bootstrap)
-            auxiliary = AuxiliaryLoss(options.loss.failure_weight, term, self._failures(term, members))
-        loss = OfflineValueLoss(value, bootstrap=bootstrap)
+        loss = OfflineValueLoss(value, bootstrap=members is not None)
         batches = self._batches(loss, members, tags=VALUE_TAGS)
-        return Learner("value", loss, batches, lr=options.optim.lr, auxiliary=auxiliary, **self._how)
+        return Learner("value", loss, batches, lr=options.optim.lr, **self._how)
 
     def _value_td_learner(self) -> Learner:
         """Equation (4)."""
@@ -182,43 +171,6 @@ class LS3Trainer:
         loss.set_keys(label=label)  # under the buffer's keys, which need not be the classifier's
         return Learner(name, loss, self._batches(loss), lr=self.options.optim.lr, **self._how)
 
-    def _make_failure_value(self) -> float:
-        """What failing for a whole episode returns, −(1 − γ^T) / (1 − γ), unless another value was asked for."""
-        value, gamma = self.options.loss.failure_value, self.buffer.gamma
-        if value is not None:
-            return value
-        steps = self.episode_length or int(self.buffer.transitions.storage[:]["steps_left"].max())
-        return -(1.0 - gamma**steps) / (1.0 - gamma) if gamma < 1.0 else -float(steps)
-
-    def _failures(self, loss: LatentLoss, members: int | None) -> BatchStream:
-        """States of the violating demonstrations, labelled with the value of failure."""
-        return BatchStream(
-            self.buffer,
-            max(self.options.optim.batch_size // 4, 1),
-            RowSelection(tags=[Tag.CONSTRAINT]),
-            reads=loss,
-            extra_keys=[self.buffer.keys.constraint, ("next", "latent")],
-            members=members,
-            change=self._label_failures,
-        )
-
-    def _label_failures(self, batches: TensorDictBase) -> TensorDictBase:
-        rows = batches
-        if self.options.loss.failure_rows == "violating":
-            rows = torch.stack([self._violating(batch) for batch in batches.unbind(0)])
-        if self._failure_value is None:
-            self._failure_value = self._make_failure_value()
-        return rows.set("reward_to_go", torch.full_like(rows["reward_to_go"], self._failure_value))
-
-    def _violating(self, batch: TensorDictBase) -> TensorDictBase:
-        """Those states of a batch that violate, in its size: they stand in for the others."""
-        rows = batch.flatten()
-        found = rows[self.buffer.keys.constraint].flatten().nonzero().flatten()
-        if len(found):
-            rows = rows[found[torch.arange(len(rows), device=found.device) % len(found)]]
-            rows.set("latent", rows["next", "latent"])
-        return rows.reshape(batch.shape)
-
     def _weigh(self, rows: TensorDictBase) -> TensorDictBase:
         """Rows for equation (5): how much online episodes that timed out count is an option."""
         timed_out = rows["timed_out"] & (rows["tag"] == int(Tag.ONLINE))
@@ -236,7 +188,6 @@ class LS3Trainer:
         require_actions_of(self.agent, self.buffer)
         warn_of_missing_outcomes(self.buffer)
         steps = self.options.offline
-        self._failure_value = None
         self._group.train(
             [
                 ("dynamics", steps.dynamics_steps, "Dynamics"),

@@ -34,11 +34,6 @@ def wants_bf16(autocast: Autocast, device: torch.device) -> bool:
     return fastest_precision(device.type) == "bf16" if autocast == "auto" else bool(autocast)
 
 
-def cooled_down(fraction: float, cooldown: float) -> float:
-    """What a learning rate has fallen to after a fraction of a phase's steps: 1, then linearly to 0 at the end."""
-    return 1.0 if fraction < 1.0 - cooldown else (1.0 - fraction) / cooldown
-
-
 def log_scalars(logger: Logger | None, phase: str, step: int, scalars: dict[str, float]) -> None:
     """Write metrics under ``phase/name``; nowhere without a logger."""
     if logger is not None:

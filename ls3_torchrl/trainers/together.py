@@ -14,10 +14,7 @@ from ls3_torchrl.trainers.steps import is_finite, set_gradients, threads
 
 def can_train_together(learners: Sequence[Learner]) -> bool:
     """Whether learners can take the same steps at once: losses of networks of one shape, computed in one precision."""
-    plain = all(
-        type(one) is Learner and one.is_independent and one.auxiliary is None and one.optimizer is not None
-        for one in learners
-    )
+    plain = all(type(one) is Learner and one.is_independent and one.optimizer is not None for one in learners)
     if not plain or len({_kind(learner) for learner in learners}) > 1:
         return False
     parameters = [id(parameter) for learner in learners for parameter in learner.loss.parameters()]

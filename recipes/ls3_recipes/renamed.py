@@ -39,6 +39,11 @@ REMOVED: dict[str, Any] = {
     "online.select": "best",
     "vae.unit_scale": True,
     "planner.goal_reduction": "count",
+    "agent.initial_value": 0.0,
+    "loss.failure_weight": 0.0,
+    "loss.failure_rows": "all",
+    "loss.failure_value": None,
+    "optim.cooldown": 0.0,
     "policy.learn_alpha": False,
     "policy.zero_at_goal": False,
 }

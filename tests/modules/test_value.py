@@ -59,19 +59,9 @@ def test_missing_latent_is_named():
         ValueEnsemble(8, hidden=(16,))(TensorDict({"z": torch.zeros(4, 8)}, [4]))
 
 
-def test_initial_value_shifts_an_untrained_ensemble_and_nothing_else():
-    torch.manual_seed(0)
-    plain = ValueEnsemble(4, num_members=3, hidden=(8,))
-    torch.manual_seed(0)
-    shifted = ValueEnsemble(4, num_members=3, hidden=(8,), initial_value=-100.0)
-    td = TensorDict({"latent": torch.randn(6, 4)}, [6])
-    difference = shifted(td.clone())["state_value"] - plain(td.clone())["state_value"]
-    torch.testing.assert_close(difference, torch.full((6, 3, 1), -100.0))
-
-
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
 def test_it_computes_in_the_dtype_it_was_moved_to(dtype: torch.dtype):
-    value, latent = ValueEnsemble(8, hidden=(16,), initial_value=-2.0), torch.randn(4, 8)
+    value, latent = ValueEnsemble(8, hidden=(16,)), torch.randn(4, 8)
     before = value(TensorDict({"latent": latent}, [4]))["state_value"]
     after = value.to(dtype)(TensorDict({"latent": latent.to(dtype)}, [4]))["state_value"]
     assert after.dtype == dtype

@@ -67,7 +67,6 @@ NUMBERS = {
         [
             "buffer.gamma",
             "loss.gamma_safe_set",
-            "optim.cooldown",
             "planner.p_random",
             "planner.p_constant",
             "policy.risk.gamma",
@@ -96,7 +95,6 @@ NUMBERS = {
     ),
     **dict.fromkeys(
         [
-            "loss.failure_weight",
             "loss.timed_out_weight",
             "planner.noise_scale",
             "planner.pessimism",
@@ -106,8 +104,6 @@ NUMBERS = {
         ],
         ("[", 0, INF, ")"),
     ),
-    "agent.initial_value": ("(", -INF, INF, ")"),
-    "loss.failure_value": ("(", -INF, INF, ")"),
 }
 FLAGS = {
     "agent.background",
@@ -120,7 +116,6 @@ FLAGS = {
 }
 WORDS = {
     "encoder": ("latents", "conv"),
-    "loss.failure_rows": ("all", "violating"),
     "optim.autocast": (True, False, "auto"),
     "planner.engine": ("auto", "fused", "rollout"),
     "planner.precision": ("auto", "fp32", "bf16"),
@@ -134,7 +129,7 @@ SIZES = {"agent.dynamics_hidden", "agent.value_hidden", "agent.classifier_hidden
 PAIRS = {"vae.warmup"}
 TEXTS = {"algorithm", "preset", "device", "output"}
 PATHS = {"data", "scratch_dir", "vae.checkpoint", "output"}
-OR_NULL = {"data", "output", "scratch_dir", "vae.checkpoint", "vae.warmup", "loss.failure_value"}
+OR_NULL = {"data", "output", "scratch_dir", "vae.checkpoint", "vae.warmup"}
 OR_NULL |= {"planner.constraint_threshold", "planner.safe_set_threshold", "tracker"}
 
 

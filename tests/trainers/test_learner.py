@@ -15,8 +15,8 @@ from ls3_torchrl import LS3Agent
 from ls3_torchrl.baselines import AWACLoss, action_value, gaussian_actor
 from ls3_torchrl.modules import ValueEnsemble
 from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, TD1ValueLoss
-from ls3_torchrl.trainers import AuxiliaryLoss, DivergenceError, Learner, LearnerGroup
-from ls3_torchrl.trainers.steps import cooled_down, threads
+from ls3_torchrl.trainers import DivergenceError, Learner, LearnerGroup
+from ls3_torchrl.trainers.steps import threads
 
 
 def values(value, latent):
@@ -80,28 +80,6 @@ def test_a_loss_that_is_not_finite_stops_the_phase_with_a_remedy():
         learner.train(3, "Value")
 
 
-def test_an_auxiliary_loss_pulls_the_same_network_with_its_weight(recorder):
-    value = ValueEnsemble(4, num_members=1, hidden=(16,))
-    z = torch.zeros(32, 4)
-    near_batch = TensorDict({"latent": z, "reward_to_go": torch.full((32, 1), -5.0)}, [32])
-    far_batch = TensorDict({"latent": z, "reward_to_go": torch.full((32, 1), -60.0)}, [32])
-    # On the same states, a term of weight 3 draws the least-squares value to three quarters of the way.
-    both = AuxiliaryLoss(3.0, OfflineValueLoss(value), lambda: far_batch)
-    learner = Learner(
-        "value",
-        OfflineValueLoss(value),
-        lambda: near_batch,
-        lr=0.05,
-        auxiliary=both,
-        logger=recorder,
-        progress=False,
-    )
-    learner.train(600, "Value")
-    middle = (-5.0 + 3.0 * -60.0) / 4.0
-    assert values(value, z[:1]).item() == pytest.approx(middle, abs=0.5)
-    assert recorder.values("Value/auxiliary")
-
-
 @pytest.mark.parametrize("name", ["dynamics", "value", "safe_set"])
 def test_losses_and_gradients_under_bf16_agree_with_fp32(name):
     agent = LS3Agent(action_dim=2, latent_dim=8)
@@ -135,20 +113,6 @@ def test_losses_and_gradients_under_bf16_agree_with_fp32(name):
     torch.testing.assert_close(rough, exact, rtol=5e-3, atol=0.0)
     assert not torch.equal(rounded, gradient)
     assert (rounded - gradient).norm() < 0.05 * gradient.norm()  # bf16 rounds by 0.4 % at every product
-
-
-def test_the_learning_rate_falls_to_nothing_in_the_last_part_of_every_phase():
-    fractions = (0.0, 0.25, 0.5, 0.75, 0.9)
-    assert [cooled_down(fraction, 0.5) for fraction in fractions] == pytest.approx([1, 1, 1, 0.5, 0.2])
-    assert cooled_down(0.99, 0.0) == 1.0
-    value = ValueEnsemble(4, num_members=2, hidden=(8,))
-    rows = TensorDict({"latent": torch.randn(8, 4), "reward_to_go": torch.zeros(8, 1)}, [8])
-    rates = []
-    learner = Learner("value", OfflineValueLoss(value), lambda: rows, lr=0.4, cooldown=0.5, progress=False)
-    learner.optimizer.register_step_pre_hook(lambda adam, *_: rates.append(adam.param_groups[0]["lr"]))
-    for _ in range(2):  # every phase starts warm again
-        learner.train(4, "Value")
-    assert rates == pytest.approx([0.4, 0.4, 0.4, 0.2] * 2)
 
 
 def td1_learner(seed):
@@ -222,7 +186,7 @@ def test_threads_are_put_back_even_when_the_work_fails():
 @pytest.mark.parametrize("stop", [1, 4, 9, 12])
 def test_a_phase_that_was_stopped_at_any_step_is_taken_up_there(recorder, stop):
     whole, _ = td1_learner(0)
-    whole.logger, whole.cooldown = recorder, 0.5
+    whole.logger = recorder
     whole.train(12, "Value")
     first, generator = td1_learner(0)
     kept = {}
@@ -232,11 +196,11 @@ def test_a_phase_that_was_stopped_at_any_step_is_taken_up_there(recorder, stop):
             kept.update(state=first.state_dict(), draws=generator.get_state())
             raise KeyboardInterrupt
 
-    first.cooldown, first.after_step = 0.5, keep
+    first.after_step = keep
     with pytest.raises(KeyboardInterrupt):
         first.train(12, "Value")
     second, later = td1_learner(1)
-    second.cooldown, second.logger = 0.5, type(recorder)()
+    second.logger = type(recorder)()
     later.set_state(kept["draws"])
     second.load_state_dict(kept["state"])
     second.train(12, "Value")

@@ -98,44 +98,6 @@ def test_episodes_that_timed_out_count_as_the_option_says_online_alone(make_agen
     assert not any(rows["next", key].flatten()[light].any() for key in ("success", "constraint"))
 
 
-def test_failures_are_violating_demonstrations_at_the_value_of_failure(make_agent, filled):
-    agent = make_agent()
-    buffer = filled(agent)
-    trainer = trainer_of(agent, buffer, loss=LossOptions(failure_weight=0.5, failure_value=-42.0))
-    trainer.value.auxiliary.sample.extra_keys += ("tag",)
-    rows = trainer.value.auxiliary.sample()
-    assert (rows["tag"] == int(Tag.CONSTRAINT)).all()
-    assert (rows["reward_to_go"] == -42.0).all()
-    assert trainer.value.auxiliary.weight == 0.5
-    # The buffer itself keeps the returns that were seen.
-    assert (buffer.sample(50, tags=["constraint"])["reward_to_go"] > -42.0).all()
-
-
-@pytest.mark.parametrize(("length", "steps"), [(3, 3), (None, 9)])
-def test_failures_may_be_the_violating_states_and_have_the_value_of_an_episode_without_success(
-    make_agent, episode, length, steps
-):
-    agent = make_agent()
-    buffer = TaggedReplayBuffer(100, latent_dim=8)
-    buffer.add(episode(constraint=7), "constraint")
-    buffer.encode(agent.encoder)
-    options = LS3Options(loss=LossOptions(failure_weight=0.5, failure_rows="violating"), optim=OPTIM)
-    trainer = LS3Trainer(agent, buffer, options, episode_length=length, progress=False)
-    rows = trainer.value.auxiliary.sample()
-    assert rows.batch_size == (4, agent.value.num_members)
-    assert rows["next", "constraint"].all()
-    assert torch.equal(rows["latent"], rows["next", "latent"])
-    value = -sum(0.99**i for i in range(steps))
-    torch.testing.assert_close(rows["reward_to_go"], torch.full_like(rows["reward_to_go"], value))
-
-
-def test_without_discount_failing_costs_every_step(make_agent, filled):
-    agent = make_agent()
-    buffer = filled(agent, gamma=1.0)
-    trainer = trainer_of(agent, buffer, loss=LossOptions(failure_weight=0.5))
-    assert (trainer.value.auxiliary.sample()["reward_to_go"] == -9.0).all()
-
-
 def test_mean_latents_feed_posterior_means_to_the_models_that_are_named(make_agent, filled):
     agent = make_agent()
     trainer = trainer_of(agent, filled(agent), loss=LossOptions(mean_latents=("dynamics", "goal")))
@@ -254,7 +216,7 @@ def test_states_under_keys_of_ones_own_train_as_pixels_do(episode, recorder):
     encoder = TensorDictModule(torch.nn.Identity(), [keys.observation], ["latent"])
     agent = LS3Agent(action_dim=2, latent_dim=3, encoder=encoder, num_values=2, num_dynamics=2)
     buffer.encode(agent.encoder)
-    options = LS3Options(OfflineOptions(2, 2, 2), OnlineOptions(1, 1, 1), OPTIM, LossOptions(failure_weight=0.5))
+    options = LS3Options(OfflineOptions(2, 2, 2), OnlineOptions(1, 1, 1), OPTIM)
     trainer = LS3Trainer(agent, buffer, options, logger=recorder, progress=False)
     trainer.train_offline()
     trainer.update()
@@ -280,7 +242,7 @@ def test_a_value_function_without_members_trains_too(make_agent, filled):
     value = TensorDictModule(Scalar(), ["latent"], ["state_value"])
     agent = make_agent(value=value)
     before = value.module.layer.weight.detach().clone()
-    options = LS3Options(OfflineOptions(2, 2, 2), optim=OPTIM, loss=LossOptions(failure_weight=0.5))
+    options = LS3Options(OfflineOptions(2, 2, 2), optim=OPTIM)
     LS3Trainer(agent, filled(agent), options, progress=False).train_offline()
     assert not torch.equal(value.module.layer.weight, before)
 
@@ -289,7 +251,7 @@ def test_an_agent_in_double_precision_trains_on_what_the_buffer_holds(make_agent
     agent = make_agent()
     buffer = filled(agent)
     agent.double()
-    options = LS3Options(OfflineOptions(2, 2, 2), optim=OPTIM, loss=LossOptions(failure_weight=0.5))
+    options = LS3Options(OfflineOptions(2, 2, 2), optim=OPTIM)
     trainer = LS3Trainer(agent, buffer, options, progress=False)
     trainer.train_offline()
     assert all(p.dtype == torch.float64 for p in agent.parameters())
@@ -318,7 +280,7 @@ def test_a_constraint_that_is_known_and_a_goal_that_is_frozen_need_no_training(m
 def test_a_copy_of_a_trainer_draws_from_a_buffer_of_its_own(make_agent, filled):
     agent = make_agent()
     buffer = filled(agent)
-    trainer = trainer_of(agent, buffer, loss=LossOptions(failure_weight=0.5))
+    trainer = trainer_of(agent, buffer)
     for other in (copy.deepcopy(trainer), pickle.loads(pickle.dumps(trainer))):
         assert other.buffer is not buffer
         buffer.draw = other.buffer.draw = None  # whoever draws from it says so

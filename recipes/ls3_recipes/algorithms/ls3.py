@@ -52,7 +52,7 @@ class LS3(Algorithm):
         """Make the learners of every equation."""
         how: dict[str, Any] = {"logger": logger, "after_step": after_step}
         self.vae = VAETrainer(self.agent, buffer, self.settings.vae, **how)
-        self.trainer = LS3Trainer(self.agent, buffer, self.settings.training, episode_length=horizon, **how)
+        self.trainer = LS3Trainer(self.agent, buffer, self.settings.training, **how)
 
     def phases(self) -> dict[str, Callable[[], None]]:
         """Equation (1), then the others on its latents."""

@@ -164,7 +164,7 @@ class Costs:
 
     def _trainer(self, **changes: Any) -> LS3Trainer:
         training = dataclasses.replace(self.settings.training, **changes)
-        return LS3Trainer(self.algorithm.agent, self.buffer, training, episode_length=self.horizon, progress=False)
+        return LS3Trainer(self.algorithm.agent, self.buffer, training, progress=False)
 
     def _time_worlds(self, phase: str, worlds: int) -> None:
         """Steps of worlds side by side: the plans of one batch, and the simulation."""
