@@ -40,7 +40,7 @@ def test_each_learner_draws_from_the_data_that_the_paper_names(make_agent):
     agent, buffer, drawn = make_agent(), TaggedReplayBuffer(100, latent_dim=8), {}
 
     def draw(batches, rows, selection, *, generator):
-        assert selection.without is None
+        assert selection.without == ("after_violation" if current == "dynamics" else None)
         assert selection.steps is None
         assert selection.online_fraction == 0.25
         drawn[current] = ({tag.name.lower() for tag in selection.tags}, rows // OPTIM.batch_size)
