@@ -342,11 +342,11 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _drop_removed(path: Path, content: dict[str, Any]) -> None:
     """Leave out what is gone, and say where the agent planned otherwise with it. Its weights stay right."""
+    content["architecture"].pop("initial_value", None)  # of the value networks, whose weights are known
     for group, removed in _REMOVED.items():
         values = content.get(group)
         if not isinstance(values, dict):
             continue
-        values.pop("initial_value", None)  # of the value networks, whose weights are known
         for name, only in removed.items():
             value = values.pop(name, only)
             if value != only:

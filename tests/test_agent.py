@@ -242,7 +242,7 @@ def test_a_file_of_version_one_is_read_with_a_warning(tmp_path):
 
 
 GONE = {
-    "architecture": {"propagation": "ts1"},
+    "architecture": {"initial_value": -60.0, "propagation": "ts1"},
     "planner": {"common_noise": True, "constraint_reduction": "max", "goal_reduction": "count", "min_std": 0.0},
 }
 
@@ -266,7 +266,13 @@ def test_a_file_with_settings_that_are_gone_is_read_where_they_are_what_all_agen
 
 @pytest.mark.parametrize(
     ("group", "name", "value"),
-    [("architecture", "propagation", "tsinf"), ("planner", "common_noise", False), ("planner", "min_std", 0.05)],
+    [
+        ("architecture", "propagation", "tsinf"),
+        ("planner", "common_noise", False),
+        ("planner", "min_std", 0.05),
+        ("planner", "constraint_reduction", "mean"),
+        ("planner", "goal_reduction", "expected"),
+    ],
 )
 def test_a_file_whose_agent_planned_otherwise_with_a_setting_that_is_gone_is_read_with_a_warning(
     tmp_path, group, name, value

@@ -116,7 +116,7 @@ class CrossEntropyMethod:
             p_constant=p_constant,
         )
         self.num_candidates = num_candidates
-        self.num_elites = max(num_candidates // 10, 1) if num_elites is None else num_elites
+        self.num_elites = max(int(num_candidates) // 10, 1) if num_elites is None else num_elites
         self.optim_steps = optim_steps
         self.p_random = p_random
         self.p_constant = p_constant

@@ -70,7 +70,7 @@ class Learner:
         after_step: Callable[[], object] | None = None,
     ) -> None:
         self.names = [names] if isinstance(names, str) else list(names)
-        self.loss, self.sample, self.bf16 = loss, sample, bf16
+        self.loss, self.sample, self.lr, self.bf16 = loss, sample, lr, bf16
         self.logger, self.progress, self.after_step = logger, progress, after_step
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         #: ``None`` where there is nothing to train: a constraint that is known, a goal estimator that is frozen.
@@ -302,6 +302,8 @@ class Learner:
         self.loss.load_state_dict(state_dict["loss"])
         if self.optimizer is not None:
             self.optimizer.load_state_dict(state_dict["optimizer"])
+            for group in self.optimizer.param_groups:
+                group["lr"] = self.lr  # that of this learner, which may be lower where the other one diverged
         self.steps, self._phase_steps = state_dict["steps"], state_dict["phase_steps"]
         self._phase = state_dict["phase"]
         for stream, state in zip(self.streams, state_dict["streams"], strict=True):

@@ -135,8 +135,8 @@ class VAETrainer:
     def _rescale(self) -> None:
         """Measure the latents in units of their own spread; the prediction term leaves their scale open."""
         halves = self.agent.encoder, self.agent.decoder
-        self._rescaled = True
         if not all(hasattr(half, "rescale") for half in halves):
+            self._rescaled = True
             return
         spread = float(self.buffer.transitions.storage[:]["loc"].std(0).square().mean().sqrt())
         if not spread > 0.0:
@@ -146,6 +146,7 @@ class VAETrainer:
             )
         for half in halves:
             half.rescale(1.0 / spread)
+        self._rescaled = True
         self.encode()
 
     def encode(self) -> None:

@@ -219,7 +219,7 @@ class Experiment:
             # An agent that acted, and is known by its episodes; the last one never did.
             best = best_update(self.online)
             self.algorithm.restore(self.folder.agent(best))
-            console.print(f"agent.pt is the agent of update {best + 1}, whose episodes went best")
+            console.print(f"agent.pt is {self.folder.agent(best).name}, whose episodes went best")
         self.agent_file = self.algorithm.save(self.folder.path / "agent.pt").name
 
     def evaluate(self) -> None:

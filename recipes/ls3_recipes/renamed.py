@@ -134,20 +134,33 @@ def rename_settings(
 
 def _drop_removed(settings: dict[str, Any], *, trained: bool) -> None:
     """Leave out what is gone; where an agent was trained with it, say so, otherwise refuse."""
+    gone = {}
     for old, only in REMOVED.items():
         section, name = old.split(".")
         values = settings.get(section)
         if not isinstance(values, dict) or name not in values:
             continue
         value = values.pop(name)
-        if value == only:
-            continue
-        if not trained:
+        if old == "vae.unit_scale":
+            only = bool(values.get("prediction_weight"))
+        if value != only and not trained:
             raise ValueError(f"{removed(old)} Got {value!r}.")
-        warnings.warn(
-            f"This run had {old} = {value!r}, a setting that is gone: its agent does now what runs did at {only!r}.",
-            stacklevel=4,
-        )
+        if value != only:
+            gone[old] = value
+    if gone:
+        _tell_of_gone(gone)
+
+
+def _tell_of_gone(gone: Mapping[str, Any]) -> None:
+    """Say in one line with what a run was trained that is gone, and what of it matters to its agent now."""
+    said = ", ".join(f"{name}={json.dumps(value)}" for name, value in gone.items())
+    planned = [name for name in gone if name.startswith("planner.") or name == "agent.propagation"]
+    acts = "" if not planned else f" Its agent plans now without {', '.join(planned)}."
+    message = f"this run was trained with settings that are gone: {said}.{acts}"
+    if command := _COMMAND.get():
+        print(f"{command}: {message}", file=sys.stderr)
+        return
+    warnings.warn(message[0].upper() + message[1:], stacklevel=5)
 
 
 def removed(name: str) -> str:
@@ -157,6 +170,8 @@ def removed(name: str) -> str:
         >>> removed("vae.crop_scale")
         'The setting vae.crop_scale is gone: all runs do now what it did at null. Leave it out.'
     """
+    if name == "vae.unit_scale":
+        return f"The setting {name} is gone: it follows vae.prediction_weight. Leave it out."
     only = json.dumps(REMOVED[name]).strip('"')
     return f"The setting {name} is gone: all runs do now what it did at {only}. Leave it out."
 

@@ -46,7 +46,8 @@ class EpisodeSettings:
     """The episodes of online improvement.
 
     Args:
-        updates: rounds of episodes, each followed by an update; 0 for offline training alone.
+        updates: rounds of episodes, each followed by an update; 0 for offline training alone. ``agent.pt`` is the agent
+            whose own round went best, by violations and then return; the one after the last update has none.
         episodes_per_update: collected side by side in each round.
     """
 

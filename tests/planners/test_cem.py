@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 
@@ -401,6 +402,12 @@ def test_a_negative_number_of_restarts_is_refused():
     cem = CrossEntropyMethod(num_candidates=10, num_elites=2)
     with pytest.raises(ValueError, match="max_restarts must be at least 0, got -1"):
         cem(quadratic([-2.0, 1.0]), LOW, HIGH, batch=1, horizon=1, max_restarts=-1)
+
+
+@pytest.mark.parametrize(("candidates", "elites"), [(1000, 100), (2000, 200), (25, 2), (5, 1), (np.int64(30), 3)])
+def test_a_tenth_of_the_candidates_are_elites(candidates, elites):
+    found = CrossEntropyMethod(num_candidates=candidates).num_elites
+    assert (found, type(found)) == (elites, int)
 
 
 def test_the_defaults_are_the_papers():

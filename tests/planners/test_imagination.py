@@ -29,7 +29,7 @@ def problem():
     return 2 * torch.randn(B, D), torch.rand(B, N, H, A) * 2 - 1, noise
 
 
-def particle_by_particle(env, value, safe_set, latent, actions, noise, safe_reduction="mean"):
+def particle_by_particle(env, value, safe_set, latent, actions, noise, safe_reduction="mean", whole=False):
     """The definition, one particle of one plan at a time."""
     shapes = [(B, N, P, 2), (B, N, P, H), (B, N, P, H), (B, N, P)]
     values, goals, constraints, safe = (torch.zeros(shape) for shape in shapes)
@@ -44,6 +44,8 @@ def particle_by_particle(env, value, safe_set, latent, actions, noise, safe_redu
                 constraints[b, n, p, t] = env.constraint.probability(z).squeeze()
             values[b, n, p] = value.network(z).squeeze(-1)
             safe[b, n, p] = safe_set.probability(z).squeeze()
+    if whole:
+        return constraints
     return values.mean(2), goals.mean(2), constraints.amax(2), safe.amin(2) if safe_reduction == "min" else safe.mean(2)
 
 
@@ -84,6 +86,9 @@ def test_members_make_a_difference():
     # Otherwise the comparisons above would show little.
     env, value, safe_set = modules()
     latent, actions, noise = problem()
+    expected = particle_by_particle(env, value, safe_set, latent, actions, noise)
+    whole = particle_by_particle(env, value, safe_set, latent, actions, noise, whole=True)
+    assert (expected[2] > whole.mean(2) + 0.01).any()  # the largest over particles is not the mean
     other = ImaginationNoise((noise.members + 1) % M, noise.noise)
     imagine = RolloutImagination(env, value, safe_set)
     assert not torch.allclose(imagine(latent, actions, noise).value, imagine(latent, actions, other).value, atol=1e-3)

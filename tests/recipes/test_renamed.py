@@ -1,12 +1,21 @@
 """Former names of settings are read, with a warning that gives the present one; what is gone is told."""
 
+import re
+
 import pytest
 from omegaconf import OmegaConf
 
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.configuration import settings_of_run, train_settings
 from ls3_recipes.options import as_dict, defaults
-from ls3_recipes.renamed import REMOVED, RENAMED, RENAMED_OF_BENCHMARK, rename_overrides, rename_settings
+from ls3_recipes.renamed import (
+    REMOVED,
+    RENAMED,
+    RENAMED_OF_BENCHMARK,
+    on_command_line,
+    rename_overrides,
+    rename_settings,
+)
 
 
 def has(name):
@@ -116,15 +125,41 @@ def test_a_setting_that_is_gone_is_none_and_arguments_that_set_it_are_told(name)
 def test_a_run_that_was_trained_with_a_setting_that_is_gone_is_read(tmp_path, name, only):
     section, key = name.split(".")
     settings = train_settings(*having(name))
-    for value in (only, 7):
+    for value in (False if name == "vae.unit_scale" else only, 7):
         values = as_dict(settings)
         values[section][key] = value
         OmegaConf.save(OmegaConf.create(values), tmp_path / "config.yaml")
-        if value == only:
+        if value == (False if name == "vae.unit_scale" else only):  # the preset smoke predicts no latents
             assert settings_of_run(tmp_path) == settings
         else:
-            with pytest.warns(UserWarning, match=f"had {name} = 7"):
+            with pytest.warns(UserWarning, match=f"trained with settings that are gone: {name}="):
                 assert settings_of_run(tmp_path) == settings
+
+
+def test_what_a_run_had_that_is_gone_is_told_in_one_line(tmp_path, capsys):
+    values = as_dict(train_settings("preset=smoke"))
+    values["planner"] |= {"goal_reduction": "expected", "min_std": 0.0}
+    values["optim"]["cooldown"] = 0.25
+    values["vae"] |= {"unit_scale": True, "prediction_weight": 1.0}
+    OmegaConf.save(OmegaConf.create(values), tmp_path / "config.yaml")
+    gone = 'goal_reduction="expected", optim.cooldown=0.25. Its agent plans now without planner.goal_reduction.'
+    with pytest.warns(UserWarning, match=re.escape(f"trained with settings that are gone: planner.{gone}")):
+        settings_of_run(tmp_path)
+    with on_command_line("ls3 report"):
+        settings_of_run(tmp_path)
+    assert capsys.readouterr().err == f"ls3 report: this run was trained with settings that are gone: planner.{gone}\n"
+
+
+@pytest.mark.parametrize(
+    ("weight", "scaled", "fits"), [(0, False, True), (1, True, True), (0, True, False), (1, False, False)]
+)
+def test_latents_have_their_own_unit_where_they_are_predicted(weight, scaled, fits):
+    settings = {"vae": {"prediction_weight": weight, "unit_scale": scaled}}
+    if fits:
+        assert rename_settings(settings, explicit=()) == {"vae": {"prediction_weight": weight}}
+    else:
+        with pytest.raises(ValueError, match=r"vae\.unit_scale is gone: it follows vae\.prediction_weight"):
+            rename_settings(settings, explicit=())
 
 
 def test_in_a_file_of_ones_own_a_setting_that_is_gone_may_only_say_what_all_runs_do():

@@ -183,6 +183,15 @@ def test_threads_are_put_back_even_when_the_work_fails():
     assert torch.get_num_threads() == before
 
 
+def test_a_state_is_continued_at_the_learning_rate_of_the_learner_that_reads_it():
+    first, _ = td1_learner(0)
+    first.train(3, "Value")
+    second, _ = td1_learner(0)
+    second.lr = 1e-5
+    second.load_state_dict(first.state_dict())
+    assert [group["lr"] for group in second.optimizer.param_groups] == [1e-5]
+
+
 @pytest.mark.parametrize("stop", [1, 4, 9, 12])
 def test_a_phase_that_was_stopped_at_any_step_is_taken_up_there(recorder, stop):
     whole, _ = td1_learner(0)

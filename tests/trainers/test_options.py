@@ -101,7 +101,6 @@ def test_numpys_numbers_are_numbers(number):
         (VAEOptions, "autocast", True),
         (OfflineOptions, "value_steps", 0),
         (OnlineOptions, "fraction", 0.0),
-        (OptimOptions, "lr", 1.0),
         (LossOptions, "mean_latents", ["dynamics", "goal"]),
         (LossOptions, "gamma_safe_set", 0.0),
     ],
