@@ -76,7 +76,10 @@ MISTAKES = {
         (("collect", "task.horizon=7"), "task.horizon matters to ls3 train alone, got 7"),
     ],
     "together": [
-        (("train", "preset=cpu", "buffer.gamma=1"), "buffer.gamma must be below 1 with buffer.continue_failures=true"),
+        (
+            (*TRAIN, "buffer.continue_failures=true", "buffer.gamma=1"),
+            "buffer.gamma must be below 1 with buffer.continue_failures=true",
+        ),
         ((*TRAIN, "loss.dynamics_horizon=500"), "loss.dynamics_horizon must not exceed the 12 steps of an episode"),
         ((*TRAIN, "planner.horizon=13"), "planner.horizon must not exceed the 12 steps of an episode, got 13."),
         (
