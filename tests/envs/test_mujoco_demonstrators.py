@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ls3_envs import collect_offline
+from ls3_envs import CableRoutingEnv, collect_offline
 from ls3_envs.pushing import block_positions
 from ls3_envs.reacher import OBSTACLE, OBSTACLE_RADIUS, finger_position
 
@@ -38,6 +38,15 @@ def test_reachers_demonstrations_keep_their_distance_from_the_disc():
     margin = distance.amin(1) - OBSTACLE_RADIUS
     assert margin.median() > 0.02
     assert margin.min() > 0.015
+
+
+def test_cable_demonstrations_keep_three_pixels_from_the_obstacle_and_cover_the_goal_to_the_end():
+    data = collect_offline("cable_routing", "success", episodes=8, seed=0)
+    obstacle = CableRoutingEnv()._obstacle_mask.float()
+    near = torch.nn.functional.max_pool2d(obstacle[None], 7, stride=1, padding=3)[0] > 0
+    cable = data["next", "pixels"][..., 0, :, :] > 0
+    assert not (cable & near).any()
+    assert data["next", "success"][:, -5:].all()
 
 
 def test_wandering_torques_stay_in_the_box_and_wander():

@@ -72,3 +72,16 @@ def test_the_sweep_switches_every_change_back_but_those_that_cost_hours():
     for arm, changes in zip(arms, names, strict=True):
         switched = settings_of("task=navigation", "preset=cpu", *arm)
         assert [switched[name] for name in changes] == [PAPER[name] for name in changes]
+
+
+@pytest.mark.parametrize("task", ["reacher", "cable_routing"])
+def test_a_task_has_a_sweep_that_switches_its_own_changes_back(task):
+    tuned = flat(OmegaConf.to_container(OmegaConf.load(CONF / "tuned" / f"{task}-cpu.yaml")))
+    arms = yaml.safe_load((CONF / "sweep" / f"ablation_{task}.yaml").read_text(encoding="utf-8"))["arms"]
+    assert arms[0] == []
+    switched = dict(argument.split("=", 1) for arm in arms for argument in arm)
+    # How many updates there are is how long a run takes.
+    assert set(switched) == set(tuned) - {"online.updates"}
+    otherwise = settings_of(f"task={task}", "preset=paper") | {name: CPU[name] for name in CHANGED}
+    for name in switched:
+        assert settings_of(f"task={task}", "preset=cpu", f"{name}={switched[name]}")[name] == otherwise[name]

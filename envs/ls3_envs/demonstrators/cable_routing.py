@@ -5,15 +5,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ls3_envs.cable_routing import GOAL, MAX_STEP, OBSTACLE
+from ls3_envs.cable_routing import MAX_STEP, OBSTACLE
 from ls3_envs.demonstrators.scripted import Scripted
 
-#: Well over the obstacle, then to the right, above the goal.
-_OVER = ((-0.13, 0.15), (0.13, 0.15))
+#: Well over the obstacle, to the right until the cable trails behind well past it, then down until it covers the goal.
+#: Straight to the goal the cable's end would come within a pixel of the obstacle.
+_WAY = ((-0.13, 0.15), (0.16, 0.15), (0.14, 0.02))
 
 
 class CableDemonstrator(Scripted):
-    """Lifts the grasped end well over the obstacle, moves it to the right, then straight to the goal.
+    """Lifts the grasped end well over the obstacle, moves it to the right past the goal, then lays the cable over it.
+
+    The cable keeps five pixels from the obstacle: what passes it more closely cannot be told from what touches it.
 
     Args:
         noise_std: standard deviation of the noise on the displacements, in metres.
@@ -35,7 +38,7 @@ class CableDemonstrator(Scripted):
 
     def _along(self, state: Tensor, is_init: Tensor) -> Tensor:
         """The next displacement along the waypoints, ``[N, 2]``, each coordinate at most 1.5 cm."""
-        way = state.new_tensor([*_OVER, GOAL])
+        way = state.new_tensor(_WAY)
         reached = self._for_the_episode("reached", torch.zeros_like(state[:, :1]), is_init)
         place = state[:, :2]
         target = way[reached.long().squeeze(-1)]
