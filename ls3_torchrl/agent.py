@@ -37,7 +37,13 @@ _PACKAGES = ("ls3-torchrl", "torch", "torchrl", "tensordict")
 #: Settings that are gone, in files of before, and the value that is the only one now.
 _REMOVED: dict[str, dict[str, Any]] = {
     "architecture": {"propagation": "ts1"},
-    "planner": {"common_noise": True, "constraint_reduction": "max", "goal_reduction": "count", "min_std": 0.0},
+    "planner": {
+        "common_noise": True,
+        "constraint_reduction": "max",
+        "goal_reduction": "count",
+        "min_std": 0.0,
+        "pessimism": 0.0,
+    },
 }
 
 

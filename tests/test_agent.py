@@ -202,7 +202,7 @@ def acts(planner):
 
 def test_a_loaded_agent_plans_as_it_did_in_its_run(tmp_path):
     agent = tiny()
-    action = acts(agent.planner(SPEC, **(OPTIONS | {"safe_set_threshold": 0.5, "pessimism": 1.0})))
+    action = acts(agent.planner(SPEC, **(OPTIONS | {"safe_set_threshold": 0.5, "noise_scale": 0.5})))
     loaded = LS3Agent.load(agent.save(tmp_path / "agent.pt"))
     planner = loaded.planner()
     assert (planner.horizon, planner.optimizer.num_candidates, planner.safe_set_threshold) == (2, 20, 0.5)
@@ -297,7 +297,7 @@ def test_numbers_of_numpy_and_torch_can_be_saved_and_read(tmp_path, numbers):
     agent = tiny(**numbers)
     loaded = LS3Agent.load(agent.save(tmp_path / "agent.pt"))
     assert loaded.architecture == agent.architecture
-    planner = agent.planner(SPEC, **(OPTIONS | {"horizon": np.int64(3), "pessimism": np.float32(0.5)}))
+    planner = agent.planner(SPEC, **(OPTIONS | {"horizon": np.int64(3), "noise_scale": np.float32(0.5)}))
     assert LS3Agent.load(agent.save(tmp_path / "agent.pt")).planner().horizon == planner.horizon
 
 

@@ -8,7 +8,6 @@ from ls3_torchrl.data.episodes import episode_from_arrays, split_episodes
 from ls3_torchrl.data.keys import EpisodeKeys
 from ls3_torchrl.data.labels import (
     after_violation,
-    failure_tail,
     in_success,
     length_without_idle_end,
     reward_to_go,
@@ -34,7 +33,6 @@ __all__ = [
     "check_datasets",
     "check_episodes",
     "episode_from_arrays",
-    "failure_tail",
     "in_success",
     "length_without_idle_end",
     "load_episodes",

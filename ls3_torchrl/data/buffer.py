@@ -45,8 +45,6 @@ class TaggedReplayBuffer:
             ones that came before all online ones are kept.
         latent_dim: D.
         gamma: γ of the ``reward_to_go`` labels, and of what is learnt from them.
-        continue_failures: label episodes that never reach the goal as if they went on for ever
-            (:func:`~ls3_torchrl.data.failure_tail`), instead of ending with the horizon.
         success_tail: steps kept of the successes that an episode ends with; ``None`` keeps all. Once the task is done
             nothing happens, and such steps can be most of the data.
         keys: where episodes keep their entries, and where sampled rows have them; the defaults of
@@ -60,9 +58,8 @@ class TaggedReplayBuffer:
         device: where sampled batches live.
 
     Raises:
-        ValueError: for a capacity below 1, γ outside [0, 1], γ = 1 with ``continue_failures``, or a key that the buffer
-            needs for itself; in :meth:`add`, for episodes that cannot be understood, or that there is no room for: of
-            several, none is stored then.
+        ValueError: for a capacity below 1, γ outside [0, 1], or a key that the buffer needs for itself; in :meth:`add`,
+            for episodes that cannot be understood, or that there is no room for: of several, none is stored then.
         TypeError: in :meth:`add`, for images of another dtype than uint8, or entries that are no tensors.
         KeyError: in :meth:`add`, for a missing key.
         RuntimeError: in :meth:`sample`, without encoder or without rows of the selection; in :meth:`encode` and
@@ -94,7 +91,6 @@ class TaggedReplayBuffer:
         *,
         latent_dim: int = 32,
         gamma: float = 0.99,
-        continue_failures: bool = False,
         success_tail: int | None = None,
         keys: EpisodeKeys | None = None,
         extra_keys: Iterable[NestedKey] = (),
@@ -106,12 +102,6 @@ class TaggedReplayBuffer:
         self.latent_dim = int(require_at_least(latent_dim, 1, "latent_dim"))
         BufferOptions(capacity=capacity, gamma=float(gamma), success_tail=success_tail)
         self.gamma = float(gamma)
-        self.continue_failures = bool(continue_failures)
-        if self.continue_failures and self.gamma == 1.0:
-            raise ValueError(
-                "gamma must be below 1 with continue_failures=True, got 1.0: a failure that goes on for ever would "
-                "return minus infinity. Lower it, for example to 0.99."
-            )
         self.success_tail = None if success_tail is None else int(success_tail)
         self.device = torch.device(device)
         self.keys = keys or EpisodeKeys()
@@ -262,7 +252,6 @@ class TaggedReplayBuffer:
             keys=keys,
             extra_keys=self.extra_keys,
             gamma=self.gamma,
-            continue_failures=self.continue_failures,
         )
         return TensorDict({}, [len(frames)]).set(keys.observation, frames), rows
 
@@ -470,7 +459,6 @@ class TaggedReplayBuffer:
                     "capacity": self.capacity,
                     "latent_dim": self.latent_dim,
                     "gamma": self.gamma,
-                    "continue_failures": self.continue_failures,
                     "success_tail": self.success_tail,
                     "keys": asdict(self.keys),
                     "extra_keys": self.extra_keys,

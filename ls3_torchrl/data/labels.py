@@ -7,13 +7,12 @@ from torch import Tensor
 from torchrl.objectives.value.functional import reward2go
 
 
-def reward_to_go(reward: Tensor, gamma: float, tail: Tensor | None = None) -> Tensor:
+def reward_to_go(reward: Tensor, gamma: float) -> Tensor:
     """Σ_{i≥0} γ^i r_{t+i} up to the trajectory's end (the target of equation (3)).
 
     Args:
         reward: ``[*B, T, 1]``.
         gamma: γ in [0, 1].
-        tail: return of what follows the last step, ``[*B, 1]``; nothing follows when ``None``.
 
     Returns:
         ``[*B, T, 1]``.
@@ -24,38 +23,9 @@ def reward_to_go(reward: Tensor, gamma: float, tail: Tensor | None = None) -> Te
     """
     if gamma == 0.0:  # reward2go's filter would be empty
         return reward.clone()
-    if tail is not None:
-        last = reward[..., -1:, :] + gamma * tail.unsqueeze(-2)
-        reward = torch.cat([reward[..., :-1, :], last], dim=-2)
     end = torch.zeros_like(reward, dtype=torch.bool)
     end[..., -1, :] = True
     return reward2go(reward, end, gamma).reshape(reward.shape)
-
-
-def failure_tail(reward: Tensor, success: Tensor, gamma: float) -> Tensor:
-    """Return of what follows an episode that the horizon cut off before it ever reached the goal.
-
-    Such an episode is taken to go on for ever with its last reward, r_T / (1 − γ): exact for an agent that a
-    violation has frozen. After an episode that did reach the goal nothing is added.
-
-    Args:
-        reward: ``[*B, T, 1]``.
-        success: bool ``[*B, T, 1]``.
-        gamma: γ in [0, 1).
-
-    Returns:
-        ``[*B, 1]``.
-
-    Example:
-        >>> failed, reward = torch.zeros(3, 1, dtype=torch.bool), -torch.ones(3, 1)
-        >>> tail = failure_tail(reward, failed, gamma=0.5)
-        >>> reward_to_go(reward, gamma=0.5, tail=tail).flatten().tolist()
-        [-2.0, -2.0, -2.0]
-    """
-    if not 0.0 <= gamma < 1.0:
-        raise ValueError(f"An endless tail needs gamma in [0, 1), got {gamma}.")
-    endless = reward[..., -1, :] / (1.0 - gamma)
-    return torch.where(success.any(-2), torch.zeros_like(endless), endless)
 
 
 def timed_out(success: Tensor, constraint: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from tensordict import NestedKey, NonTensorData, TensorDict, TensorDictBase
 from torch import Tensor
 
 from ls3_torchrl.data.keys import EpisodeKeys, as_tuple
-from ls3_torchrl.data.labels import after_violation, failure_tail, in_success, reward_to_go, timed_out
+from ls3_torchrl.data.labels import after_violation, in_success, reward_to_go, timed_out
 from ls3_torchrl.data.tags import Tag
 
 #: Entries of rows that an episode's own must not be called.
@@ -39,7 +39,6 @@ def episode_rows(
     keys: EpisodeKeys,
     extra_keys: Iterable[NestedKey] = (),
     gamma: float,
-    continue_failures: bool = False,
 ) -> TensorDict:
     """The steps of an episode with their labels and posteriors.
 
@@ -50,21 +49,19 @@ def episode_rows(
         keys: where it keeps its entries.
         extra_keys: further entries that are kept.
         gamma: γ of the ``reward_to_go``.
-        continue_failures: label an episode that never reaches the goal as if it went on for ever.
 
     Returns:
         ``[T]``.
     """
     steps = len(episode)
     reward, constraint, success = (episode.get(key) for key in (keys.reward, keys.constraint, keys.success))
-    tail = failure_tail(reward, success, gamma) if continue_failures else None
     rows = TensorDict(
         {
             "tag": torch.full((steps, 1), int(tag), dtype=torch.uint8),
             "in_success": in_success(success),
             "after_violation": after_violation(constraint),
             "timed_out": timed_out(success, constraint),
-            "reward_to_go": reward_to_go(reward, gamma, tail),
+            "reward_to_go": reward_to_go(reward, gamma),
             "steps_left": torch.arange(steps, 0, -1).unsqueeze(-1),
         },
         [steps],

@@ -91,11 +91,6 @@ class TD1ValueLoss(LaggedTargetLoss):
         gamma: γ in [0, 1] (Table 1: 0.99).
         zero_at_goal: the target is 0 where the reward is 0, since the agent may stay in the goal set; this is
             what the authors' code does.
-        monte_carlo: the target is at least the return that was seen, max(r_t + γ V_θ'(z_{t+1}), Σ_{i≥0} γ^i r_{t+i}),
-            as MCAC does for Q (Wilcox et al. 2022, arXiv 2210.07432). A return that was reached once bounds the
-            value of acting well from below, so that failures nearby do not wash out what demonstrations have shown.
-            The labels of failed episodes must not end with the horizon
-            (``TaggedReplayBuffer(continue_failures=True)``). ``False`` is the paper.
         bootstrap: the batch is ``[B, M]`` and member m learns from column m alone; the value must be an ensemble.
 
     Returns:
@@ -126,14 +121,12 @@ class TD1ValueLoss(LaggedTargetLoss):
             latent (NestedKey): z_t.
             next_latent (NestedKey): z_{t+1}.
             reward (NestedKey): r_t, the reward of the step from t.
-            reward_to_go (NestedKey): Σ_{i≥0} γ^i r_{t+i}, read with ``monte_carlo`` alone.
             lagged_value_target (NestedKey): what V_θ(z_t) is compared with; computed where a batch lacks it.
         """
 
         latent: NestedKey = "latent"
         next_latent: NestedKey = ("next", "latent")
         reward: NestedKey = ("next", "reward")
-        reward_to_go: NestedKey = "reward_to_go"
         lagged_value_target: NestedKey = "lagged_value_target"
 
     target_name, lagged = "lagged_value_target", "value"
@@ -147,7 +140,6 @@ class TD1ValueLoss(LaggedTargetLoss):
         *,
         gamma: float = 0.99,
         zero_at_goal: bool = True,
-        monte_carlo: bool = False,
         bootstrap: bool = False,
     ) -> None:
         super().__init__()
@@ -157,9 +149,8 @@ class TD1ValueLoss(LaggedTargetLoss):
         self.out_keys = ["loss_value"]
         self.gamma = require_unit_interval(gamma, "gamma")
         self.zero_at_goal = zero_at_goal
-        self.monte_carlo = monte_carlo
         self.bootstrap = bootstrap
-        self._optional = frozenset({"lagged_value_target"} if monte_carlo else {"lagged_value_target", "reward_to_go"})
+        self._optional = frozenset({"lagged_value_target"})
 
     def _values(self, latent: Tensor, which: str) -> Tensor:
         options = {"per_member": True} if self.bootstrap else {}
@@ -175,17 +166,14 @@ class TD1ValueLoss(LaggedTargetLoss):
         return torch.where(reward == 0, torch.zeros_like(target), target) if self.zero_at_goal else target
 
     def targets(self, tensordict: TensorDictBase) -> Tensor:
-        """:meth:`target` of transitions, at least the return that was seen with ``monte_carlo``."""
+        """:meth:`target` of transitions."""
         keys = self.tensor_keys
-        target = self.target(tensordict.get(keys.next_latent), tensordict.get(keys.reward))
-        if not self.monte_carlo:
-            return target
-        return torch.maximum(target, with_members(tensordict.get(keys.reward_to_go), target, "TD1ValueLoss"))
+        return self.target(tensordict.get(keys.next_latent), tensordict.get(keys.reward))
 
     @property
     def target_settings(self) -> tuple[float, ...]:
         """γ, and which targets are changed."""
-        return self.gamma, self.zero_at_goal, self.monte_carlo
+        return self.gamma, self.zero_at_goal
 
     @property
     def has_targets_by_row(self) -> bool:

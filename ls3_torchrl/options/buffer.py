@@ -21,7 +21,6 @@ class BufferOptions:
 
     capacity: int
     gamma: float = 0.99
-    continue_failures: bool = False
     success_tail: int | None = None
 
     def __post_init__(self) -> None:

@@ -31,7 +31,6 @@ class ControlOptions:
     relaxation: float = 0.8
     max_relaxations: int = 5
     safe_set_reduction: SafeSetReduction = "mean"
-    pessimism: float = 0.0
     noise_scale: float = 1.0
     engine: EngineName = "auto"
     precision: Precision = "auto"
@@ -44,8 +43,7 @@ class ControlOptions:
             if getattr(self, name) is not None:
                 require_probability(getattr(self, name), name)
         require_at_least(self.max_relaxations, 0, "max_relaxations")
-        for name in ("pessimism", "noise_scale"):
-            require_not_negative(getattr(self, name), name)
+        require_not_negative(self.noise_scale, "noise_scale")
         require_choice(self.engine, ("auto", "fused", "rollout"), "engine")
         require_choice(self.precision, ("auto", "fp32", "bf16"), "precision")
         require_choice(self.safe_set_reduction, ("mean", "min"), "safe_set_reduction")

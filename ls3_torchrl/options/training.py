@@ -215,8 +215,6 @@ class LossOptions:
     Args:
         gamma_safe_set: γ_S in [0, 1] (Table 1).
         zero_at_goal: the target of equation (4) is 0 where the reward is 0, as in the authors' code.
-        monte_carlo: targets of equation (4) are at least the return that was seen
-            (:class:`~ls3_torchrl.objectives.TD1ValueLoss`); needs a buffer with ``continue_failures``.
         mean_latents: which of ``"dynamics"``, ``"constraint"`` and ``"goal"`` learn from the posteriors' means instead
             of samples.
         dynamics_horizon: steps over which equation (2) carries each prediction on, at least 1 (the paper: 1).
@@ -226,14 +224,13 @@ class LossOptions:
 
     gamma_safe_set: float = 0.3
     zero_at_goal: bool = True
-    monte_carlo: bool = False
     mean_latents: tuple[str, ...] = ()
     dynamics_horizon: int = 1
     timed_out_weight: float = 1.0
 
     def __post_init__(self) -> None:
         _require_fraction(self.gamma_safe_set, "gamma_safe_set")
-        _require_flags(self, "zero_at_goal", "monte_carlo")
+        _require_flags(self, "zero_at_goal")
         _require_count(self.dynamics_horizon, 1, "dynamics_horizon")
         _require_not_negative(self.timed_out_weight, "timed_out_weight")
         if isinstance(self.mean_latents, str):

@@ -84,7 +84,6 @@ class LS3Planner(MPCPlannerBase):
         safe_set_reduction: over particles, ``"mean"`` as the authors' code or ``"min"``: every particle must end
             in the safe set. A mean of δ_S lets a fraction 1 − δ_S of the particles end anywhere, and a plan gains from
             sending them where the value is overestimated.
-        pessimism: κ ≥ 0, subtracts κ standard deviations over the value ensemble; 0 is the paper.
         noise_scale: factor on the dynamics' learnt standard deviation, at least 0; 1 is the paper. With 0 the
             particles differ by their members alone. Where latents are samples of wide posteriors, most of that
             deviation is the posteriors' own, and with few particles it drowns what tells one plan from another.
@@ -144,7 +143,6 @@ class LS3Planner(MPCPlannerBase):
         relaxation: float = 0.8,
         max_relaxations: int = 5,
         safe_set_reduction: SafeSetReduction = "mean",
-        pessimism: float = 0.0,
         noise_scale: float = 1.0,
         engine: EngineName = "auto",
         precision: Precision = "auto",
@@ -165,7 +163,6 @@ class LS3Planner(MPCPlannerBase):
             relaxation=relaxation,
             max_relaxations=max_relaxations,
             safe_set_reduction=safe_set_reduction,
-            pessimism=pessimism,
             noise_scale=noise_scale,
             engine=engine,
             precision=precision,
@@ -173,7 +170,7 @@ class LS3Planner(MPCPlannerBase):
         self.horizon, self.num_particles = horizon, num_particles
         self.safe_set_threshold, self.constraint_threshold = safe_set_threshold, constraint_threshold
         self.relaxation, self.max_relaxations = float(relaxation), max_relaxations
-        self.pessimism, self.noise_scale = pessimism, noise_scale
+        self.noise_scale = noise_scale
         self.value, self.safe_set, self.encoder = value, safe_set, encoder
         self._require_modules()
         self.engine = Engine(
@@ -272,7 +269,7 @@ class LS3Planner(MPCPlannerBase):
         """Objective, feasibility and fallback ranking of candidates under δ_S ``[b, 1]``; 0 allows every end."""
         limit, inside = self._constraint_limit, self.safe_set_threshold is not None
         return PlanScores(
-            objective(statistics, pessimism=self.pessimism),
+            objective(statistics),
             feasible(statistics, safe_set_threshold=threshold, constraint_threshold=limit),
             least_harm(statistics, constraint_threshold=limit, safe_set=inside),
             restart=~ends_inside(statistics, safe_set_threshold=threshold).any(-1),

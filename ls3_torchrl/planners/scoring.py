@@ -26,7 +26,7 @@ class PlanStatistics(NamedTuple):
     safe_set_prob: Tensor
 
 
-def objective(statistics: PlanStatistics, *, pessimism: float = 0.0) -> Tensor:
+def objective(statistics: PlanStatistics) -> Tensor:
     """Mean of V(z_H) over particles and members + imagined steps in the goal, ``[*B, N]``.
 
     Counting steps in the goal (mean goal probability above one half) equals summing the rewards −1 and 0 up
@@ -34,12 +34,8 @@ def objective(statistics: PlanStatistics, *, pessimism: float = 0.0) -> Tensor:
 
     Args:
         statistics: of the candidates.
-        pessimism: κ ≥ 0, subtracts κ standard deviations over members; 0 is the paper.
     """
-    value = statistics.value.mean(-1)
-    if pessimism > 0.0:
-        value = value - pessimism * statistics.value.std(-1, correction=0)
-    return value + (statistics.goal_prob > 0.5).sum(-1)
+    return statistics.value.mean(-1) + (statistics.goal_prob > 0.5).sum(-1)
 
 
 def feasible(statistics: PlanStatistics, *, safe_set_threshold: Tensor | float, constraint_threshold: float) -> Tensor:

@@ -82,11 +82,6 @@ class LS3Trainer:
                 f"The agent's latents have size {agent.architecture.latent_dim}, the buffer's {buffer.latent_dim}. "
                 "Give both the same latent_dim."
             )
-        if options.loss.monte_carlo and not buffer.continue_failures:
-            raise ValueError(
-                "LossOptions.monte_carlo needs a buffer with continue_failures=True: otherwise a failure's return "
-                "ends with the episode and is no lower bound."
-            )
         optim = options.optim
         self._how: dict[str, Any] = {
             "bf16": wants_bf16(optim.autocast, next(agent.parameters()).device),
@@ -142,7 +137,6 @@ class LS3Trainer:
             value,
             gamma=self.buffer.gamma,
             zero_at_goal=options.loss.zero_at_goal,
-            monte_carlo=options.loss.monte_carlo,
             bootstrap=members is not None,
         )
         loss.set_keys(reward=self.buffer.keys.reward)

@@ -15,7 +15,6 @@ RENAMED = {
     "vae.agent": "vae.checkpoint",
     "loss.gamma": "buffer.gamma",
     "loss.success_tail": "buffer.success_tail",
-    "loss.continue_failures": "buffer.continue_failures",
     "loss.undecided_weight": "loss.timed_out_weight",
     "online.share": "online.fraction",
     "task.buffer_capacity": "buffer.capacity",
@@ -44,6 +43,10 @@ REMOVED: dict[str, Any] = {
     "loss.failure_rows": "all",
     "loss.failure_value": None,
     "optim.cooldown": 0.0,
+    "loss.monte_carlo": False,
+    "loss.continue_failures": False,
+    "buffer.continue_failures": False,
+    "planner.pessimism": 0.0,
     "policy.learn_alpha": False,
     "policy.zero_at_goal": False,
 }

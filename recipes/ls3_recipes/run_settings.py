@@ -114,15 +114,6 @@ AgentSettings = from_signatures(
 )
 
 
-BufferSettings = from_signatures(
-    "BufferSettings",
-    "The arguments of :class:`~ls3_torchrl.data.TaggedReplayBuffer` that matter to every algorithm.",
-    BufferOptions,
-    without=("continue_failures",),
-    check=BufferOptions,
-)
-
-
 def require_within(steps: int, episode: int, name: str) -> None:
     """Raise ``ValueError`` for more steps than an episode has."""
     if steps > episode:
@@ -171,7 +162,7 @@ class RunSettings:
     task: TaskSettings
     agent: AgentSettings  # type: ignore[valid-type]
     vae: VAEOptions
-    buffer: BufferSettings  # type: ignore[valid-type]
+    buffer: BufferOptions
     online: EpisodeSettings
     evaluation: EvaluationSettings
 

@@ -583,9 +583,9 @@ def test_keys_above_or_below_the_buffers_own_are_refused(changes):
 
 def test_a_buffer_made_with_numbers_of_numpy_can_be_saved(tmp_path):
     numbers = {"latent_dim": np.int64(D), "gamma": np.float32(0.5), "success_tail": np.int64(2)}
-    buffer = TaggedReplayBuffer(np.int64(20), **numbers, continue_failures=np.bool_(True))
+    buffer = TaggedReplayBuffer(np.int64(20), **numbers)
     buffer.add(Camera().shoot(3), "success")
     buffer.dumps(tmp_path / "saved")
-    again = TaggedReplayBuffer(20, latent_dim=D, gamma=0.5, success_tail=2, continue_failures=True)
+    again = TaggedReplayBuffer(20, latent_dim=D, gamma=0.5, success_tail=2)
     again.loads(tmp_path / "saved")
     assert len(again) == 3

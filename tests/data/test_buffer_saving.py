@@ -12,7 +12,7 @@ from torchrl.checkpoint import Checkpoint
 from ls3_torchrl.data import EpisodeKeys, TaggedReplayBuffer, episode_from_arrays
 
 KEYS = EpisodeKeys(("agent", "state"), ("agent", "action"), ("next", "cost"), ("next", "hit"), ("next", "there"))
-OPTIONS = {"latent_dim": 2, "gamma": 0.9, "continue_failures": True, "success_tail": 2, "keys": KEYS}
+OPTIONS = {"latent_dim": 2, "gamma": 0.9, "success_tail": 2, "keys": KEYS}
 
 # Rings are to wrap round here, whatever is in them.
 pytestmark = pytest.mark.filterwarnings("ignore:A buffer of .* is full:ls3_torchrl.data.DataWarning")
@@ -159,7 +159,7 @@ def test_an_empty_buffer_is_restored(tmp_path, way):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("capacity", 41), ("gamma", 0.5), ("latent_dim", 3), ("continue_failures", False), ("success_tail", None)],
+    [("capacity", 41), ("gamma", 0.5), ("latent_dim", 3), ("success_tail", None)],
 )
 @pytest.mark.parametrize("way", WAYS[:2])
 def test_content_of_other_settings_is_refused_and_changes_nothing(tmp_path, way, name, value):

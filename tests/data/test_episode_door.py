@@ -443,10 +443,6 @@ def test_entries_that_are_no_ordinary_tensors_are_refused(wrong):
         make_buffer().add(data, "success")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [({"gamma": 1.1}, "gamma must lie in"), ({"gamma": 1.0, "continue_failures": True}, "gamma must be below 1")],
-)
-def test_discounts_that_make_no_labels_are_refused_by_the_buffer(options, message):
-    with pytest.raises(ValueError, match=message):
-        TaggedReplayBuffer(10, **options)
+def test_discounts_that_make_no_labels_are_refused_by_the_buffer():
+    with pytest.raises(ValueError, match="gamma must lie in"):
+        TaggedReplayBuffer(10, gamma=1.1)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ls3_torchrl.data import after_violation, failure_tail, in_success, length_without_idle_end, reward_to_go, timed_out
+from ls3_torchrl.data import after_violation, in_success, length_without_idle_end, reward_to_go, timed_out
 
 
 def test_reward_to_go_by_hand():
@@ -65,34 +65,6 @@ def test_timed_out_keeps_the_rows_of_a_batch_apart():
     success = torch.zeros(2, 5, 1, dtype=torch.bool)
     success[0, 3] = True
     assert timed_out(success, torch.zeros_like(success)).squeeze(-1).int().tolist() == [[0] * 5, [1] * 5]
-
-
-def test_a_failure_goes_on_for_ever_with_its_last_reward():
-    gamma, reward = 0.9, -torch.ones(4, 1)
-    tail = failure_tail(reward, torch.zeros(4, 1, dtype=torch.bool), gamma)
-    assert tail.item() == pytest.approx(-10.0)  # -(1 + 0.9 + 0.81 + ...)
-    # Continued for ever, every step of a constant failure is worth the same.
-    torch.testing.assert_close(reward_to_go(reward, gamma, tail), torch.full((4, 1), -10.0))
-
-
-def test_nothing_follows_an_episode_that_reached_the_goal_even_if_it_left_again():
-    reward = torch.tensor([[-1.0], [0.0], [-1.0]])
-    success = torch.tensor([[False], [True], [False]])
-    tail = failure_tail(reward, success, 0.5)
-    assert tail.item() == 0.0
-    assert reward_to_go(reward, 0.5, tail).flatten().tolist() == [-1.25, -0.5, -1.0]
-
-
-def test_tails_of_a_batch_are_told_apart():
-    reward = -torch.ones(2, 3, 1)
-    success = torch.zeros(2, 3, 1, dtype=torch.bool)
-    success[1, 2] = True
-    assert failure_tail(reward, success, 0.5).flatten().tolist() == [-2.0, 0.0]
-
-
-def test_an_undiscounted_tail_is_refused():
-    with pytest.raises(ValueError, match=r"gamma in \[0, 1\), got 1.0"):
-        failure_tail(-torch.ones(3, 1), torch.zeros(3, 1, dtype=torch.bool), 1.0)
 
 
 def test_after_violation_marks_the_steps_behind_the_first_violation_row_by_row():

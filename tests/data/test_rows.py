@@ -28,16 +28,6 @@ def test_rows_hold_the_labels_that_an_episode_has_under_its_own_keys():
     assert set(rows.keys(True, True)) - {*keys.required, "x"} <= OWN_KEYS
 
 
-def test_failures_go_on_where_that_is_asked_for():
-    no = torch.zeros(2, 1, dtype=torch.bool)
-    step = {"reward": -torch.ones(2, 1), "constraint": no, "success": no}
-    episode = TensorDict({"action": torch.zeros(2, 1), "next": step}, [2])
-    posteriors = TensorDict({"loc": torch.zeros(3, 1), "scale": torch.zeros(3, 1)}, [3])
-    options = {"keys": EpisodeKeys(), "gamma": 0.5, "continue_failures": True}
-    rows = episode_rows(episode, posteriors, Tag.ONLINE, **options)
-    assert rows["reward_to_go"].flatten().tolist() == [-2.0, -2.0]
-
-
 def test_keys_of_the_rows_own_are_refused():
     require_free(["action", ("next", "reward"), ("deep", "loc")])
     with pytest.raises(ValueError, match=r"keys \['tag'\] are the buffer's own"):

@@ -53,7 +53,6 @@ LOSSES: dict[str, Callable[[], LossModule]] = {
     "dynamics": lambda: EnsembleDynamicsLoss(EnsembleDynamics(D, A, hidden=(8,), action_scale=0.5)),
     "offline_value": lambda: OfflineValueLoss(ValueEnsemble(D, hidden=(8,))),
     "td1_value": lambda: lagged(TD1ValueLoss(ValueEnsemble(D, hidden=(8,)))),
-    "monte_carlo": lambda: lagged(TD1ValueLoss(ValueEnsemble(D, hidden=(8,)), monte_carlo=True)),
     "safe_set": lambda: lagged(SafeSetLoss(SafeSet(D, hidden=(8,)))),
     "constraint": lambda: ClassifierLoss(ConstraintEstimator(D, hidden=(8,))),
     "goal": lambda: ClassifierLoss(GoalEstimator(D, hidden=(8,))),

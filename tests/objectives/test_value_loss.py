@@ -114,21 +114,6 @@ def test_td1_bootstrap_column_m_teaches_member_m():
     assert loss(steps(z, z_next, rewards))["loss_value"].item() == pytest.approx(sum(cells) / 4)
 
 
-@pytest.mark.parametrize("bootstrap", [False, True])
-def test_with_monte_carlo_the_target_is_at_least_the_return_that_was_seen(bootstrap: bool):
-    # V' = 2 z': the bootstraps are -1 + 0.5 * 2 * (-4) = -5 and -1 + 0.5 * 2 * (-1) = -2.
-    z, z_next, seen = [0.5, 3.0], [-4.0, -1.0], [-3.0, -7.0]
-    batch = steps(z, z_next, [-1.0, -1.0]).set("reward_to_go", column(seen))
-    loss = td1_loss(linear_value(2.0), gamma=0.5, monte_carlo=True, bootstrap=bootstrap)
-    if bootstrap:
-        batch = batch.reshape(2, 1)
-    by_hand = ((2.0 * 0.5 - max(-5.0, -3.0)) ** 2 + (2.0 * 3.0 - max(-2.0, -7.0)) ** 2) / 2
-    assert loss(batch)["loss_value"].item() == pytest.approx(by_hand)
-    assert "reward_to_go" in loss.in_keys
-    with pytest.raises(KeyError, match="reward_to_go"):
-        loss(batch.exclude("reward_to_go"))
-
-
 def test_target_uses_the_lagged_weights():
     value = linear_value(2.0)
     loss = td1_loss(value, gamma=0.5)
@@ -296,11 +281,10 @@ def single_value(slope: float) -> TensorDictModule:
     return value
 
 
-@pytest.mark.parametrize("monte_carlo", [False, True])
-def test_a_single_value_learns_as_an_ensemble_of_one(monte_carlo: bool):
+def test_a_single_value_learns_as_an_ensemble_of_one():
     batch = steps([0.5, 3.0], [1.5, 2.0], [-1.0, 0.0]).set("reward_to_go", column([-2.0, -1.5]))
     single, ensemble = single_value(2.0), linear_value(2.0)
-    for make, options in ((OfflineValueLoss, {}), (td1_loss, {"gamma": 0.5, "monte_carlo": monte_carlo})):
+    for make, options in ((OfflineValueLoss, {}), (td1_loss, {"gamma": 0.5})):
         ours, theirs = make(single, **options)(batch), make(ensemble, **options)(batch)
         torch.testing.assert_close(ours["loss_value"], theirs["loss_value"])
         ours["loss_value"].backward()

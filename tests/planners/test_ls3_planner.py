@@ -73,19 +73,6 @@ def test_only_the_end_of_a_plan_must_be_safe():
     assert (path[:2] > 1.2).all()
 
 
-def test_pessimism_avoids_what_the_members_disagree_on():
-    torch.manual_seed(0)
-    # V = 3x and -x: on average x, with a standard deviation of 2|x|.
-    wide = {"num_candidates": 300, "num_elites": 10, "optim_steps": 5}
-    bold, timid = stub_planner(**wide), stub_planner(pessimism=1.0, **wide)
-    for planner in (bold, timid):
-        with torch.no_grad():
-            planner.value.network.weights[0].zero_()[:, 0, 0] = torch.tensor([3.0, -1.0])
-    start = torch.zeros(1, D)
-    assert bold.plan(start).actions[0, :, 0].sum() > 2.5
-    assert timid.plan(start).actions[0, :, 0].sum().abs() < 0.3
-
-
 def test_actions_lie_within_asymmetric_bounds_and_reach_them():
     torch.manual_seed(0)
     spec = Bounded(low=torch.tensor([0.2, -3.0]), high=torch.tensor([0.5, -1.0]), shape=(A,))
@@ -438,7 +425,6 @@ def test_probabilities_must_lie_strictly_between_zero_and_one(name, value):
         ({"optim_steps": 0}, "optim_steps must be at least 1"),
         ({"max_relaxations": -1}, "max_relaxations must be at least 0, got -1"),
         ({"p_random": 1.5}, r"p_random must lie in \[0, 1\]"),
-        ({"pessimism": -1.0}, "pessimism must not be negative"),
         ({"noise_scale": -0.1}, "noise_scale must not be negative, got -0.1"),
         ({"engine": "jax"}, "engine must be one of 'auto', 'fused', 'rollout'; got 'jax'"),
         ({"precision": "fp8"}, "precision must be one of 'auto', 'fp32', 'bf16'; got 'fp8'"),
@@ -618,7 +604,7 @@ def test_any_modules_can_be_planned_with():
         model,
         linear(1.0, 0.0, "worth"),
         linear(0.0, 5.0, "safe"),
-        **(SMALL | {"num_candidates": 300, "num_elites": 10, "optim_steps": 6, "pessimism": 1.0}),
+        **(SMALL | {"num_candidates": 300, "num_elites": 10, "optim_steps": 6}),
     )
     assert isinstance(planner.imagine, RolloutImagination)
     result = planner.plan(torch.tensor([[0.5, 0.0, 0.0, 0.0]]))

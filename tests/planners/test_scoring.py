@@ -26,17 +26,6 @@ def test_counting_goal_steps_equals_summing_rewards_up_to_the_horizon():
     assert torch.equal(objective(plans) - 4, rewards)
 
 
-def test_pessimism_subtracts_standard_deviations_over_members():
-    # Members 1 and 5: mean 3, iteration deviation 2. Members that agree lose nothing.
-    plans = statistics(value=[[1.0, 5.0], [2.5, 2.5]])
-    assert objective(plans, pessimism=0.5).tolist() == [2.0, 2.5]
-    assert objective(plans, pessimism=0.0).tolist() == [3.0, 2.5]
-
-
-def test_pessimism_is_finite_for_a_single_member():
-    assert objective(statistics(value=[[4.0]]), pessimism=1.0).tolist() == [4.0]
-
-
 def test_feasible_asks_every_step_and_the_end_both_bounds_included():
     plans = statistics(
         constraint=[[0.25, 0.0], [0.0, 0.26], [0.0, 0.0], [0.0, 0.0], [0.9, 0.9]],

@@ -61,7 +61,6 @@ TEXT = {
     "optim.target_interval": 100,
     "planner.relaxation": 0.8,
     "planner.optim_steps": 4,  # n_cem_iters = 5 samples five iterations and scores four
-    "planner.pessimism": 0.0,
     "online.updates": 25,
     "online.episodes_per_update": 10,
     "online.value_td_steps": 2000,
@@ -211,7 +210,6 @@ def test_unknown_names_are_refused_with_what_there_is(override, error, message):
         ("awac", "offline.dynamics_steps=3", r"awac has no offline\. It has: "),
         ("bc", "online.fraction=0.3", r"bc has no online\.fraction\. Its online has: updates, "),
         ("bc", "policy.penalty=-3", r"bc has no policy\.penalty\. Its policy has: hidden, "),
-        ("bc", "buffer.continue_failures=true", r"bc has no buffer\.continue_failures"),
         ("awac", "policy.risk.gamma=0.5", r"awac has no policy\.risk\."),
         ("ls3", "policy.penalty=-3", r"ls3 has no policy\. It has: .*planner\."),
         ("ls3", "recovery=true", r"ls3 has no recovery\."),
@@ -248,7 +246,6 @@ def test_files_bring_the_settings_of_all_algorithms_and_each_is_left_its_own():
     settings = as_dict(train_settings("algorithm=sacfd", "preset=cpu", "task=pushing"))
     assert not {"planner", "optim", "loss", "offline"} & set(settings)
     assert set(settings["online"]) == {"updates", "episodes_per_update"}
-    assert "continue_failures" not in settings["buffer"]
 
 
 @pytest.mark.parametrize(
@@ -283,7 +280,6 @@ def test_a_file_with_a_setting_that_nobody_has_is_refused(setting, message):
         ("loss.timed_out_weight=-0.1", r"^loss\.timed_out_weight"),
         ("loss.mean_latents=[value]", r"^loss\.mean_latents"),
         ("loss.dynamics_horizon=0", r"^loss\.dynamics_horizon"),
-        ("loss.monte_carlo=true", r"^loss\.monte_carlo needs buffer\.continue_failures=true"),
         ("online.updates=-1", r"^online\.updates"),
         ("online.episodes_per_update=0", r"^online\.episodes_per_update"),
         ("online.fraction=1.0", r"^online\.fraction"),

@@ -97,7 +97,6 @@ NUMBERS = {
         [
             "loss.timed_out_weight",
             "planner.noise_scale",
-            "planner.pessimism",
             "policy.updates_per_step",
             "vae.beta",
             "vae.prediction_weight",
@@ -108,8 +107,6 @@ NUMBERS = {
 FLAGS = {
     "agent.background",
     "agent.control_affine",
-    "buffer.continue_failures",
-    "loss.monte_carlo",
     "loss.zero_at_goal",
     "pictures",
     "recovery",
@@ -178,8 +175,7 @@ def is_allowed(name, value):
 
 
 #: Settings that only fit with others, which then are named, too.
-TOGETHER = {"planner.num_candidates", "planner.num_elites", "planner.p_random", "planner.p_constant", "buffer.gamma"}
-TOGETHER |= {"buffer.continue_failures", "loss.monte_carlo"}
+TOGETHER = {"planner.num_candidates", "planner.num_elites", "planner.p_random", "planner.p_constant"}
 
 
 @functools.cache

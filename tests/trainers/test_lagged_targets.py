@@ -44,7 +44,7 @@ def buffer(monkeypatch) -> TaggedReplayBuffer:
 def learner_of(buffer, kind, interval=7, **options) -> Learner:
     torch.manual_seed(1)
     if issubclass(kind, TD1ValueLoss):
-        loss, members = kind(ValueEnsemble(4, num_members=2, hidden=(16,)), monte_carlo=True, bootstrap=True), 2
+        loss, members = kind(ValueEnsemble(4, num_members=2, hidden=(16,)), bootstrap=True), 2
     else:
         loss, members = kind(SafeSet(4, hidden=(16,))), None
     batches = BatchStream(buffer, 8, reads=loss, extra_keys=["reward_to_go"], members=members)

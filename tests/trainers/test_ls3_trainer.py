@@ -113,13 +113,6 @@ def test_the_discount_is_the_buffers(make_agent, filled):
     assert trainer_of(agent, filled(agent, gamma=0.7)).value_td.loss.gamma == 0.7
 
 
-def test_a_monte_carlo_bound_needs_returns_that_do_not_end_with_the_episode(make_agent, filled):
-    agent, loss = make_agent(), LossOptions(monte_carlo=True)
-    with pytest.raises(ValueError, match="continue_failures=True"):
-        trainer_of(agent, filled(agent), loss=loss)
-    trainer_of(agent, filled(agent, continue_failures=True), loss=loss)
-
-
 def test_phases_take_their_steps_in_the_papers_order(make_agent, filled, recorder):
     agent = make_agent()
     options = LS3Options(OfflineOptions(4, 2, 3), OnlineOptions(2, 1, 2), OPTIM)

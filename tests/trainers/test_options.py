@@ -61,7 +61,7 @@ def test_values_out_of_range_are_refused_by_name(options, field, value):
         (OfflineOptions, "dynamics_steps", 1.5),
         (OnlineOptions, "classifier_steps", "many"),
         (OnlineOptions, "fraction", "half"),
-        (LossOptions, "monte_carlo", "yes"),
+        (LossOptions, "zero_at_goal", "yes"),
         (LossOptions, "mean_latents", "goal"),
         (LossOptions, "dynamics_horizon", 2.5),
     ],

@@ -12,8 +12,9 @@ from typing import Any, Literal
 from ls3_recipes.options import as_dict
 from ls3_recipes.rollout_files import agents_left
 from ls3_recipes.run_files import is_finished
-from ls3_recipes.run_settings import BufferSettings, RunSettings
+from ls3_recipes.run_settings import RunSettings
 from ls3_recipes.sweep.plan import PlannedRun
+from ls3_torchrl.options.buffer import BufferOptions
 
 Kind = Literal["data", "vae", "train", "rollouts"]
 
@@ -88,7 +89,7 @@ def _vae(run: PlannedRun, output: Path, arguments: tuple[str, ...], needs: tuple
 def vae_depends_on(settings: RunSettings) -> dict[str, Any]:
     """All that a trained VAE depends on: runs that differ in none of it have the same one, whatever their algorithm."""
     named = as_dict(settings)
-    buffer = {field.name: named["buffer"][field.name] for field in fields(BufferSettings)}
+    buffer = {field.name: named["buffer"][field.name] for field in fields(BufferOptions)}
     return {"buffer": buffer} | {name: named[name] for name in ("task", "seed", "data", "device", "agent", "vae")}
 
 

@@ -26,7 +26,7 @@ MISTAKES = {
         ((*TRAIN, "offline.dynamics_steps=1.5"), "offline.dynamics_steps must be a whole number, got 1.5."),
         ((*TRAIN, "pictures=maybe"), "pictures must be true or false, got 'maybe'."),
         ((*TRAIN, "pictures=1"), "pictures must be true or false, got 1."),
-        ((*TRAIN, "loss.monte_carlo=sometimes"), "loss.monte_carlo must be true or false"),
+        ((*TRAIN, "loss.zero_at_goal=sometimes"), "loss.zero_at_goal must be true or false"),
         ((*TRAIN, "agent.value_hidden=16"), "agent.value_hidden must be a list of whole numbers, got 16."),
         (
             (*TRAIN, "agent.value_hidden=[16,big]"),
@@ -55,7 +55,7 @@ MISTAKES = {
         ((*TRAIN, "threads=0"), "threads must be at least 1, or null"),
         ((*TRAIN, "threads=-2"), "threads must be at least 1, or null"),
         ((*TRAIN, "online.dynamics_steps=-3"), "online.dynamics_steps must be at least 0, got -3."),
-        ((*TRAIN, "planner.pessimism=nan"), "planner.pessimism must be a finite number, got nan."),
+        ((*TRAIN, "planner.noise_scale=nan"), "planner.noise_scale must be a finite number, got nan."),
         ((*TRAIN, "planner.noise_scale=-inf"), "planner.noise_scale must be a finite number, got -inf."),
         ((*TRAIN, "vae.lr=inf"), "vae.lr must be a finite number, got inf."),
         ((*TRAIN, "loss.timed_out_weight=nan"), "loss.timed_out_weight must be a finite number, got nan."),
@@ -76,10 +76,6 @@ MISTAKES = {
         (("collect", "task.horizon=7"), "task.horizon matters to ls3 train alone, got 7"),
     ],
     "together": [
-        (
-            (*TRAIN, "buffer.continue_failures=true", "buffer.gamma=1"),
-            "buffer.gamma must be below 1 with buffer.continue_failures=true",
-        ),
         ((*TRAIN, "loss.dynamics_horizon=500"), "loss.dynamics_horizon must not exceed the 12 steps of an episode"),
         ((*TRAIN, "planner.horizon=13"), "planner.horizon must not exceed the 12 steps of an episode, got 13."),
         (
@@ -91,7 +87,6 @@ MISTAKES = {
             (*TRAIN, "buffer.capacity=20", "buffer.success_tail=1"),
             "buffer.capacity must be at least 24, the transitions of the offline data and of the episodes",
         ),
-        ((*TRAIN, "loss.monte_carlo=true"), "loss.monte_carlo needs buffer.continue_failures=true"),
         ((*TRAIN, "agent.action_scale=[1,2,3]"), "agent.action_scale must be one positive number or one for each of 2"),
     ],
     "names": [

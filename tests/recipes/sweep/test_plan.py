@@ -42,13 +42,13 @@ def test_no_threshold_is_a_value_like_others():
 
 
 def test_names_of_many_settings_fit_a_file_system_and_stay_apart():
-    many = [f"planner.{name}" for name in ("pessimism=2.0", "noise_scale=0.5", "safe_set_reduction=min")]
+    many = [f"planner.{name}" for name in ("relaxation=0.75", "noise_scale=0.5", "safe_set_reduction=min")]
     many += ["online.fraction=0.25", "loss.timed_out_weight=0.5", "vae.prediction_weight=12.5", "optim.lr=0.001"]
     arms = [[*many, f"loss.gamma_safe_set={gamma}"] for gamma in (0.5, 0.6)]
     one, other = names(planned_runs(arms, [], ["preset=smoke"]))
     assert one != other
     for name in (one, other):
-        assert name.startswith("ls3-navigation-pessimism=2.0-noise_scale=0.5-")
+        assert name.startswith("ls3-navigation-relaxation=0.75-noise_scale=0.5-")
         assert name.endswith("-seed0")
         assert len(name.encode()) < 180
     assert one == names(planned_runs(arms[:1], [], ["preset=smoke"]))[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ls3_recipes.run_settings import EpisodeSettings, RunSettings, require_within
-from ls3_torchrl.options.buffer import BufferOptions
 from ls3_torchrl.options.planner import PlannerOptions
 from ls3_torchrl.options.training import LossOptions, LS3Options, OfflineOptions, OnlineOptions, OptimOptions
 
@@ -24,27 +23,11 @@ class OnlineSettings(EpisodeSettings, OnlineOptions):
 class LS3Settings(RunSettings):
     """What a run of LS³ has, in addition to what every run has."""
 
-    buffer: BufferOptions
     online: OnlineSettings
     offline: OfflineOptions
     optim: OptimOptions
     loss: LossOptions
     planner: PlannerOptions
-
-    def __post_init__(self) -> None:
-        """Refuse what only the sections together are wrong in."""
-        super().__post_init__()
-        if self.buffer.continue_failures and self.buffer.gamma == 1.0:
-            raise ValueError(
-                "buffer.gamma must be below 1 with buffer.continue_failures=true, got 1.0: a failure that goes on for "
-                "ever would return minus infinity. Lower it, for example to 0.99, or set "
-                "buffer.continue_failures=false and loss.monte_carlo=false."
-            )
-        if self.loss.monte_carlo and not self.buffer.continue_failures:
-            raise ValueError(
-                "loss.monte_carlo needs buffer.continue_failures=true: otherwise a failure's return ends with the "
-                "horizon and is no lower bound."
-            )
 
     def require_horizon(self, steps: int) -> None:
         """Raise ``ValueError`` for a setting that does not fit episodes of so many steps."""
