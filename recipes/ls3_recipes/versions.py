@@ -16,7 +16,7 @@ from ls3_recipes.device import processor
 
 #: Of a run's folder.
 FORMAT = "ls3_recipes.run"
-VERSION = 5
+VERSION = 6
 PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "mujoco", "mujoco-warp", "hydra-core", "ls3-torchrl")
 
 
