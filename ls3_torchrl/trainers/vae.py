@@ -20,7 +20,7 @@ from ls3_torchrl.options.training import VAEOptions
 from ls3_torchrl.trainers.checks import require_actions_of
 from ls3_torchrl.trainers.progress import progress_bar
 from ls3_torchrl.trainers.steps import LOG_INTERVAL, is_finite, log_scalars, wants_bf16
-from ls3_torchrl.trainers.vae_gradient import TARGET, VAEGradient, in_channel_order, in_memory_order, reordered
+from ls3_torchrl.trainers.vae_gradient import AFTER, TARGET, VAEGradient, in_channel_order, in_memory_order, reordered
 
 _log = logging.getLogger(__name__)
 PHASE = "VAE"
@@ -222,9 +222,18 @@ class VAETrainer:
                 options.batch_size, without="after_violation", steps=steps if steps > 1 else None
             )
         batch = batch.to(self.device)
-        images = batch.get(self.buffer.keys.observation)
+        keys = self.buffer.keys
+        images = batch.get(keys.observation)
+        if self.prediction is not None:
+            # Images that violate are the last of all: they only come after an action.
+            after = torch.rand(options.batch_size) < 0.5
+            images = images.clone()
+            images[after] = batch.get(keys.next_observation)[after]
+            batch.set(AFTER, after.to(self.device))
         target = self._enlarge(images)
         if target is not images:
+            batch.pop(AFTER, None)
+        if target is not images or self.prediction is not None:
             batch.set(TARGET, target)
         return batch
 

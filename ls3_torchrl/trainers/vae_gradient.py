@@ -18,8 +18,9 @@ from ls3_torchrl.modules.call import encode, is_hooked
 from ls3_torchrl.modules.vae import as_unit_pixels
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
 
-#: Where a batch holds the images to encode and reconstruct, if not those that came before the action.
-TARGET = "vae_target"
+#: Where a batch holds the images to encode and reconstruct, if not those that came before the action; and which of them
+#: are those that came after it, bool ``[B]``, where they are nothing else.
+TARGET, AFTER = "vae_target", "vae_target_after"
 _Computed = tuple[dict[str, Tensor], tuple[Tensor | None, ...]]
 
 
@@ -102,12 +103,13 @@ class VAEGradient:
         with torch.autocast(noise.device.type, torch.bfloat16, enabled=self.bf16, cache_enabled=False):
             predicts = self.prediction is not None and weight
             pair: tuple[Tensor, ...] = ()
+            after = batch.get(AFTER, None)
             if not predicts:
                 loc, scale = self._encode(target)
-            elif target is images:
+            elif after is not None:
                 locs, scales = self._encode(torch.cat([images, self._next(batch)]))
-                pair, scale = locs.chunk(2), scales[: len(images)]
-                loc = pair[0]
+                pair = locs.chunk(2)
+                loc, scale = (torch.where(after[:, None], *one.chunk(2)[::-1]) for one in (locs, scales))
             else:
                 loc, scale = self._encode(target)
                 pair = self._encode(torch.cat([images, self._next(batch)]))[0].chunk(2)
