@@ -12,6 +12,7 @@ from ls3_torchrl.data import EpisodeKeys, TaggedReplayBuffer
 from ls3_torchrl.halves import Halves
 from ls3_torchrl.objectives import VAELoss
 from ls3_torchrl.trainers import DivergenceError, VAEOptions, VAETrainer
+from ls3_torchrl.trainers.vae_gradient import AFTER, TARGET
 
 FAST = {"steps": 3, "batch_size": 4, "autocast": False}
 
@@ -96,6 +97,23 @@ def test_prediction_leaves_out_what_follows_a_violation(make_agent, filled, epis
     VAETrainer(make_agent(), buffer, options, progress=False).train()
     steps = {int(step) for batch in drawn for step in batch["action"].flatten().tolist()}
     assert max(steps) == 3  # the step to the violation itself is not left out
+
+
+@pytest.mark.parametrize("prediction", [0.0, 1.0])
+def test_images_that_violate_are_reconstructed_as_often_as_others(make_agent, filled, episode, prediction):
+    buffer = filled(episode(constraint=3))
+    options = VAEOptions(**(FAST | {"batch_size": 200}), prediction_weight=prediction)
+    trainer = VAETrainer(make_agent(), buffer, options, progress=False)
+    batches = [trainer._sample() for _ in range(5)]
+    drawn = torch.cat([batch.get(TARGET, batch["pixels"]) for batch in batches])
+    violating = buffer.frames.storage[4]["pixels"]
+    share = (drawn == violating).flatten(1).all(1).float().mean().item()
+    # Of ten frames; or of the eight that come before and after the four steps to the violation.
+    assert abs(share - (0.1 if prediction == 0.0 else 0.125)) < 0.03
+    for batch in batches if prediction else []:
+        after = batch[AFTER]
+        assert torch.equal(batch[TARGET][after], batch["next", "pixels"][after])
+        assert torch.equal(batch[TARGET][~after], batch["pixels"][~after])
 
 
 @pytest.mark.parametrize(
