@@ -151,10 +151,10 @@ class SafeSetFilter(TensorDictModuleBase):
             return scores._replace(score=-distance, restart=torch.zeros_like(scores.feasible[:, 0]))
 
         found = planner.search(latent[left], nearest, 0, *self._around(proposed[left], mean, std, left))
-        merged = [ours.index_copy(0, left, theirs) for ours, theirs in zip(kept[2:4], found[2:4], strict=True)]
         action = proposed.index_copy(0, left, found.actions[:, 0])
         feasible = certified.index_copy(0, left, ~found.fallback)
-        return _Verdict(action, *merged, certified, feasible, avoidable)
+        new_mean, new_std = kept.mean.index_copy(0, left, found.mean), kept.std.index_copy(0, left, found.std)
+        return _Verdict(action, new_mean, new_std, certified, feasible, avoidable)
 
     def _around(self, proposed: Tensor, mean: Tensor | None, std: Tensor | None, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The last plan's Gaussian of the ``rows``, if there is one, but with a first action round the proposed one."""
