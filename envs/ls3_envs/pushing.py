@@ -28,8 +28,10 @@ PEG_RADIUS = 0.018
 HAND_X, HAND_Y = 0.27, (-0.175, 0.185)
 MAX_STEP = 0.05
 START_STD = 0.003
-#: How likely each block is in its goal already when an episode starts at random.
+#: How likely each block is in its goal already when an episode starts at random, and how likely an outer one stands
+#: further out, by how much at most.
 IN_GOAL_AT_RANDOM = 0.3
+ASIDE_AT_RANDOM, ASIDE = 0.5, 0.14
 SUBSTEPS = 40
 HORIZON = 150
 
@@ -71,7 +73,7 @@ def pushing_model(hand: HandName = "gripper") -> mujoco.MjModel:
     <position kp="2000" dampratio="1"/>
   </default>
   <worldbody>
-    <camera name="above" pos="0 0 .72" fovy="48"/>
+    <camera name="above" pos="0 0 .72" fovy="52"/>
     <geom name="table" type="box" pos="0 0 -.05" size="{width} {depth} .05" rgba=".55 .5 .45 1"/>
     <geom name="goal" type="box" pos="0 {GOAL_Y + goal} .0005" size="{width} {goal} .0005" rgba=".35 .65 .4 1"
           contype="0" conaffinity="0"/>
@@ -118,7 +120,8 @@ class SequentialPushingEnv(MujocoEnv):
         hand: ``"gripper"``, 8 cm wide and flat: a block that it hits off its middle still goes straight on; or
             ``"peg"``, round and 3.6 cm wide: such a block turns and slips away.
         start: ``"fixed"`` has the hand in front of the blocks, with noise of 3 mm; ``"random"`` anywhere in front of
-            them, each with probability .3 in its goal already.
+            them, each with probability .3 in its goal already, and an outer one with probability .5 up to 14 cm
+            further out.
         horizon: steps in an episode.
         image_size: side of the image in pixels.
         physics: ``"mujoco"``, or ``"warp"`` for a GPU.
@@ -184,6 +187,8 @@ class SequentialPushingEnv(MujocoEnv):
             there = generator.random(3) < IN_GOAL_AT_RANDOM
             y = np.where(there, generator.uniform(GOAL_Y + 0.01, TABLE[1] - 0.03, 3), BLOCKS_Y)
             state[1:21:7] = torch.as_tensor(y)
+            aside = np.where(generator.random(3) < ASIDE_AT_RANDOM, generator.uniform(0.0, ASIDE, 3), 0.0)
+            state[0:21:7] += torch.as_tensor(np.sign(BLOCKS_X) * aside)
         state[21:23] = torch.as_tensor(place)
         return state
 

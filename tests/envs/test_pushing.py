@@ -92,6 +92,17 @@ def test_the_arm_is_a_picture_only():
     assert float(env.model.body("hand").mass[0]) == pytest.approx(0.5)
 
 
+def test_a_block_is_seen_whole_where_it_leaves_the_table():
+    env = SequentialPushingEnv(num_envs=3, seed=0)
+    env.reset()
+    env._state[1, 0], env._state[2, 14] = -TABLE[0], TABLE[0]
+    seen = [
+        (env._view(env._state).geoms[row] == env.model.geom(f"block{block}").id).sum().item()
+        for row, block in ((0, 0), (1, 0), (2, 2))
+    ]
+    assert min(seen[1:]) >= seen[0]  # the nearer to the edge the more of a side is seen, too
+
+
 def test_a_random_start_has_each_block_in_its_place_or_in_its_goal():
     state = SequentialPushingEnv(num_envs=200, start="random", seed=0).reset()["state"]
     y = block_positions(state)[..., 1]
@@ -99,7 +110,12 @@ def test_a_random_start_has_each_block_in_its_place_or_in_its_goal():
     assert (waiting | there).all()
     assert abs(there.float().mean() - IN_GOAL_AT_RANDOM) < 0.06
     assert len(there.unique(dim=0)) == 8  # every combination
-    torch.testing.assert_close(block_positions(state)[..., 0], torch.tensor(BLOCKS_X).expand(200, 3))
+    aside = block_positions(state)[..., 0] - torch.tensor(BLOCKS_X)
+    assert (aside[:, 1] == 0).all()
+    out = torch.cat([-aside[:, 0], aside[:, 2]])
+    assert out.min() >= -1e-6
+    assert 0.13 < out.max() <= 0.14 + 1e-6
+    assert abs((out > 1e-6).float().mean() - 0.5) < 0.06
     assert (hand_position(state)[:, 1] <= -0.06).all()
 
 
