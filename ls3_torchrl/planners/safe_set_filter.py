@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -16,6 +17,9 @@ from ls3_torchrl.planners.optimizer import PlanScores
 from ls3_torchrl.planners.scoring import PlanStatistics
 
 _NAMES = ("proposed", "intervened", "feasible", "constraint", "safe_set", "distance")
+
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 class _Verdict(NamedTuple):
@@ -46,8 +50,8 @@ class SafeSetFilter(TensorDictModuleBase):
     like it: ``Collector(env, SafeSetFilter(policy, planner), auto_register_policy_transforms=True)``.
 
     Args:
-        policy: any module that writes the planner's ``action_key``; ``None`` where the tensordict holds the action
-            already, a person's for example.
+        policy: any module that writes the planner's ``action_key``, or any function from a tensordict to one, such as
+            TorchRL's ``RandomPolicy``; ``None`` where the tensordict holds the action already, a person's for example.
         planner: whose model, thresholds and optimiser are used. With ``safe_set_threshold=None`` plans may end
             anywhere, as in a filter of H steps without a terminal set.
         filter_key: group under which is written what was decided.
@@ -81,22 +85,20 @@ class SafeSetFilter(TensorDictModuleBase):
         torch.Size([3, 1])
     """
 
-    def __init__(
-        self, policy: TensorDictModuleBase | None, planner: LS3Planner, *, filter_key: NestedKey = "filter"
-    ) -> None:
+    def __init__(self, policy: Policy | None, planner: LS3Planner, *, filter_key: NestedKey = "filter") -> None:
         super().__init__()
         if not isinstance(planner, LS3Planner):
             raise TypeError(f"planner must be an LS3Planner, such as agent.planner(), got a {type(planner).__name__}.")
         self.action_key = planner.action_key
-        written = [] if policy is None else [unravel_key(key) for key in policy.out_keys]
-        if policy is not None and self.action_key not in written:
+        written = [unravel_key(key) for key in getattr(policy, "out_keys", [])]
+        if isinstance(policy, TensorDictModuleBase) and self.action_key not in written:
             raise ValueError(
                 f"The policy must write {self.action_key!r}, the planner's action, but {type(policy).__name__} writes "
                 f"{written}. Give both the same action key."
             )
         self.policy, self.planner = policy, planner
         self.keys = {name: unravel_key((filter_key, name)) for name in _NAMES}
-        reads = [self.action_key] if policy is None else policy.in_keys
+        reads = [self.action_key] if policy is None else getattr(policy, "in_keys", [])
         self.in_keys = [key for key in dict.fromkeys([*reads, *planner.in_keys]) if key not in written]
         warm = planner.warm_start.out_keys
         self.out_keys = list(dict.fromkeys([*written, self.action_key, *self.keys.values(), *warm]))

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import check_env_specs
+from torchrl.modules import RandomPolicy
 
 from ls3_torchrl.modules import ConstraintEstimator, SafeSet
 from ls3_torchrl.planners import SafeSetFilter, describe_filter
@@ -140,6 +141,15 @@ def test_a_collector_finds_the_warm_start_by_itself():
     for batch in collector:
         assert batch["next", "latent"][..., 0].max() <= EDGE + 1e-3
     collector.shutdown()
+
+
+def test_torchrls_random_policy_is_one_like_others():
+    torch.manual_seed(0)
+    env = corridor(planner := wall(p_random=0.3))
+    safe = SafeSetFilter(RandomPolicy(env.action_spec), planner)
+    path = env.rollout(60, safe, break_when_any_done=False)
+    assert path["next", "latent"][..., 0].max() <= EDGE + 1e-3
+    assert 0 < describe_filter(path)["intervention_rate"] < 0.5
 
 
 def test_what_does_not_fit_is_refused():
