@@ -7,6 +7,7 @@ from ls3_torchrl.planners.imagination import ImaginationNoise, Limits, PlanNoise
 from ls3_torchrl.planners.latent_env import LatentEnv
 from ls3_torchrl.planners.ls3 import LS3Planner
 from ls3_torchrl.planners.optimizer import Optimizer, OptimizerResult, PlanScores
+from ls3_torchrl.planners.safe_set_filter import SafeSetFilter, describe_filter
 from ls3_torchrl.planners.scoring import PlanStatistics, feasible, least_harm, objective
 from ls3_torchrl.planners.warm_start import WarmStart
 
@@ -23,7 +24,9 @@ __all__ = [
     "PlanScores",
     "PlanStatistics",
     "RolloutImagination",
+    "SafeSetFilter",
     "WarmStart",
+    "describe_filter",
     "describe_plan",
     "feasible",
     "least_harm",

@@ -176,6 +176,8 @@ class CrossEntropyMethod:
             self._keep_best(search, rows, elites)
             self._refit(search, rows, elites)
             self._restart(search, rows[elites.restart], max_restarts)
+            if scores.enough is not None:
+                search.step[rows[scores.enough & elites.feasible]] = self.optim_steps
             rows = rows[search.step[rows] < self.optim_steps]
             iteration += 1
         return search.result()

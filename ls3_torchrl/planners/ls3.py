@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -45,6 +46,9 @@ from ls3_torchrl.planners.scoring import (
     require_sound,
 )
 from ls3_torchrl.planners.warm_start import WarmStart
+
+#: Rates N imagined plans of b rows: (statistics, δ_S ``[b, 1]``, actions ``[b, N, H, A]``, rows ``[b]``) -> scores.
+RatePlans = Callable[[PlanStatistics, Tensor, Tensor, Tensor], PlanScores]
 
 
 class LS3Planner(MPCPlannerBase):
@@ -267,7 +271,7 @@ class LS3Planner(MPCPlannerBase):
 
     def score_plans(self, statistics: PlanStatistics, threshold: Tensor) -> PlanScores:
         """Objective, feasibility and fallback ranking of candidates under δ_S ``[b, 1]``; 0 allows every end."""
-        limit, inside = self._constraint_limit, self.safe_set_threshold is not None
+        limit, inside = self.constraint_limit, self.safe_set_threshold is not None
         return PlanScores(
             objective(statistics),
             feasible(statistics, safe_set_threshold=threshold, constraint_threshold=limit),
@@ -276,7 +280,7 @@ class LS3Planner(MPCPlannerBase):
         )
 
     @property
-    def _constraint_limit(self) -> float:
+    def constraint_limit(self) -> float:
         """δ_C as a number: no probability exceeds 1."""
         return 1.0 if self.constraint_threshold is None else float(self.constraint_threshold)
 
@@ -297,6 +301,37 @@ class LS3Planner(MPCPlannerBase):
             std: its standard deviation.
             noise: all randomness; drawn when ``None``.
         """
+        relaxations = 0 if self.safe_set_threshold is None else self.max_relaxations
+
+        def rate(statistics: PlanStatistics, threshold: Tensor, _actions: Tensor, _rows: Tensor) -> PlanScores:
+            return self.score_plans(statistics, threshold)
+
+        return self.search(latent, rate, relaxations, mean, std, noise)
+
+    @torch.no_grad()
+    def search(
+        self,
+        latent: Tensor,
+        rate: RatePlans,
+        relaxations: int,
+        mean: Tensor | None = None,
+        std: Tensor | None = None,
+        noise: PlanNoise | None = None,
+        *,
+        first: Tensor | None = None,
+    ) -> OptimizerResult:
+        """Search for plans that are rated otherwise than by their value.
+
+        Args:
+            latent: ``[B, D]``.
+            rate: what takes the place of :meth:`score_plans`: (statistics, δ_S ``[b, 1]``, actions ``[b, N, H, A]``,
+                rows ``[b]``) -> scores.
+            relaxations: how often δ_S may be relaxed.
+            mean: as in :meth:`plan`.
+            std: as in :meth:`plan`.
+            noise: as in :meth:`plan`.
+            first: the action ``[B, A]`` with which every plan begins, whatever is searched for the steps after it.
+        """
         latent, imagine, space = latent.float(), self.imagine, self.action_spec.space
 
         def score(actions: Tensor, rows: Tensor, restarts: Tensor, iteration: int) -> PlanScores:
@@ -305,9 +340,11 @@ class LS3Planner(MPCPlannerBase):
             else:
                 sampled = noise.of_iteration(iteration, rows)
             threshold = self._threshold(restarts).unsqueeze(-1)
-            limits = Limits(threshold, self._constraint_limit)
+            limits = Limits(threshold, self.constraint_limit)
+            if first is not None:
+                actions = torch.cat([first[rows, None, None].expand_as(actions[:, :, :1]), actions[:, :, 1:]], 2)
             statistics = imagine(latent[rows], actions, sampled, limits)
-            scores = self.score_plans(statistics, threshold)
+            scores = rate(statistics, threshold, actions, rows)
             require_sound(statistics, scores)
             return scores
 
@@ -322,7 +359,7 @@ class LS3Planner(MPCPlannerBase):
                 space.high.float(),
                 batch=latent.shape[0],
                 horizon=self.horizon,
-                max_restarts=0 if self.safe_set_threshold is None else self.max_relaxations,
+                max_restarts=relaxations,
                 mean=mean,
                 std=std,
                 noise=None if noise is None else given,
@@ -347,7 +384,7 @@ class LS3Planner(MPCPlannerBase):
         latent = self.encode(tensordict)
         batch = latent.shape[:-1]
         rows = batch.numel()
-        mean, std = self._read_warm_start(tensordict, rows)
+        mean, std = self.read_warm_start(tensordict, rows)
         result = self.plan(latent.reshape(rows, latent.shape[-1]), mean, std, noise)
         require_finite(result.actions, f"The plan of {type(self.optimizer).__name__}")
         space = self.action_spec.space
@@ -358,7 +395,8 @@ class LS3Planner(MPCPlannerBase):
         self.warm_start.write(out, result.mean, result.std)
         return out
 
-    def _read_warm_start(self, tensordict: TensorDictBase, rows: int) -> tuple[Tensor | None, Tensor | None]:
+    def read_warm_start(self, tensordict: TensorDictBase, rows: int) -> tuple[Tensor | None, Tensor | None]:
+        """The last plan's Gaussian ``[rows, H, A]``, where the optimiser uses it and the tensordict has it."""
         if not self.optimizer.uses_warm_start:
             return None, None
         mean, std = self.warm_start.read(tensordict, rows)

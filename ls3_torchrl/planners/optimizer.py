@@ -18,12 +18,15 @@ class PlanScores(NamedTuple):
         fallback: ranking ``[b, N]``, higher is better, for rows in which nothing is feasible.
         restart: bool ``[b]``, rows that are to start again under easier conditions where nothing is feasible; all of
             them when ``None``. The others go on among sequences that are not feasible, by their fallback ranking.
+        enough: bool ``[b]``, rows whose best feasible sequence needs no improvement: their search may end. None of them
+            when ``None``.
     """
 
     score: Tensor
     feasible: Tensor
     fallback: Tensor
     restart: Tensor | None = None
+    enough: Tensor | None = None
 
 
 class ScorePlans(Protocol):

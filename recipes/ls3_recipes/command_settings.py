@@ -59,15 +59,20 @@ class EvaluateSettings:
     Args:
         run: folder of a finished run.
         agent: file in it.
+        policy: ``"trained"``, the run's own, or ``"random"``, uniform actions on its task.
+        filter: folder of a run of LS³ on the same task, whose model lets the policy's actions through or replaces them
+            (:class:`~ls3_torchrl.planners.SafeSetFilter`); ``None`` for none.
         episodes: side by side.
         seed: of the environments.
         device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
         output: a folder that does not exist yet.
-        planner: settings in place of the run's; for LS³ alone.
+        planner: settings in place of the run's, for LS³ alone; where there is a filter, in place of the filter's.
     """
 
     run: str
     agent: str = "agent.pt"
+    policy: Literal["trained", "random"] = "trained"
+    filter: str | None = None
     episodes: int = 20
     seed: int = 12345
     device: str = "auto"
@@ -79,7 +84,8 @@ class EvaluateSettings:
         require_at_least(self.episodes, 1, "episodes")
         require_seed(self.seed)
         require_device_name(self.device)
-        for name in ("run", "agent", "output"):
+        require_choice(self.policy, ("trained", "random"), "policy")
+        for name in ("run", "agent", "output", *(() if self.filter is None else ("filter",))):
             require_path(getattr(self, name), name)
 
     @property

@@ -85,6 +85,11 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     console.print(table)
     for name, value in summary.get("probe", {}).items():
         console.print(f"{name.replace('_', ' ')}: {value:.2f} units of the state")
+    if "filter" in summary:
+        console.print(
+            "filter: another action in {intervention_rate:.0%} of the steps, {constraint_rate:.0%} for the constraint "
+            "and {safe_set_rate:.0%} for the safe set; no safe one in {infeasible_rate:.0%}".format(**summary["filter"])
+        )
     console.print(
         f"{summary['minutes']:.1f} minutes; everything is in [bold]{escape(str(folder))}[/bold]", soft_wrap=True
     )

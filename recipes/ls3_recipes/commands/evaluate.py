@@ -12,12 +12,14 @@ from ls3_recipes.extra import Job
 HELP = """
 Evaluate a trained agent: a table, summary.json and a video.
 
-  ls3 evaluate run=RUN_FOLDER [agent=FILE] [episodes=N] [seed=N] [planner.KEY=VALUE ...]
+  ls3 evaluate run=RUN_FOLDER [agent=FILE] [episodes=N] [seed=N] [filter=RUN_FOLDER] [planner.KEY=VALUE ...]
 
 Examples
   ls3 evaluate run=runs/navigation episodes=100
   ls3 evaluate run=runs/navigation agent=checkpoints/agent_000.pt
   ls3 evaluate run=runs/navigation planner.num_candidates=1000
+  ls3 evaluate run=runs/sacfd filter=runs/navigation  # unsafe actions are replaced: a safety filter
+  ls3 evaluate run=runs/navigation policy=random filter=runs/navigation output=runs/random-but-safe
 """
 
 register("evaluate", EvaluateSettings)

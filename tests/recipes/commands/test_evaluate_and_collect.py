@@ -60,6 +60,34 @@ def test_evaluate_takes_an_earlier_checkpoint_and_other_planner_settings(run_fol
     assert written.planner.horizon == 3  # the run's
 
 
+def test_a_filter_stands_before_any_policy(run_folder, tmp_path):
+    folder = tmp_path / "random"
+    said = (f"run={run_folder}", "policy=random", "episodes=2", f"filter={run_folder}")
+    summary = evaluated(*said, "planner.num_candidates=8", f"output={folder}")
+    assert (summary["algorithm"], summary["agent"]) == ("random", None)
+    rates = summary["filter"]
+    assert rates["intervention_rate"] == pytest.approx(rates["constraint_rate"] + rates["safe_set_rate"])
+    assert json.loads((folder / "summary.json").read_text())["filtered_by"] == str(run_folder)
+    assert OmegaConf.load(folder / "config.yaml").planner.num_candidates == 8
+    # LS³'s own planner carries its plan beside the filter's.
+    trained = evaluated(*said[:1], *said[2:], f"output={tmp_path / 'trained'}")
+    assert trained["algorithm"] == "ls3"
+    with pytest.raises(ValueError, match=r"policy must be one of 'trained', 'random', got 'careless'"):
+        evaluated(f"run={run_folder}", "policy=careless", f"output={tmp_path / 'other'}")
+
+
+def test_a_filter_is_a_run_of_ls3_on_the_same_task(run_folder, tmp_path):
+    for name, change in (("bc", {"algorithm": "bc"}), ("reacher", {"task": {"name": "reacher"}})):
+        other = tmp_path / name
+        other.mkdir()
+        config = OmegaConf.merge(OmegaConf.load(run_folder / "config.yaml"), change)
+        OmegaConf.save(config, other / "config.yaml")
+    with pytest.raises(ValueError, match=r"filter must be a run on navigation, as .* is; .*reacher is one on reacher"):
+        evaluated(f"run={run_folder}", f"filter={tmp_path / 'reacher'}", f"output={tmp_path / 'o'}")
+    with pytest.raises(FileNotFoundError, match=r"config\.yaml is missing"):
+        evaluated(f"run={run_folder}", f"filter={tmp_path}", f"output={tmp_path / 'o'}")
+
+
 def test_planner_settings_that_fit_no_planner_are_refused(run_folder, tmp_path):
     with pytest.raises(ValueError, match=r"^planner\.num_elites must lie"):
         evaluated(f"run={run_folder}", "planner.num_elites=1000", f"output={tmp_path / 'evaluation'}")
