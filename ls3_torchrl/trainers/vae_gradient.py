@@ -109,7 +109,7 @@ class VAEGradient:
             elif after is not None:
                 locs, scales = self._encode(torch.cat([images, self._next(batch)]))
                 pair = locs.chunk(2)
-                loc, scale = (torch.where(after[:, None], *one.chunk(2)[::-1]) for one in (locs, scales))
+                loc, scale = (torch.where(after[:, None], new, old) for old, new in (pair, scales.chunk(2)))
             else:
                 loc, scale = self._encode(target)
                 pair = self._encode(torch.cat([images, self._next(batch)]))[0].chunk(2)
