@@ -65,8 +65,8 @@ class SafeSetFilter(TensorDictModuleBase):
 
     Raises:
         TypeError: for a planner that is none.
-        ValueError: for a policy that does not write the action; by the call, for an action or an observation that is
-            not finite, or an action of another size.
+        ValueError: for a policy that does not write the action, or writes what the filter writes; by the call, for an
+            action or an observation that is not finite, or an action of another size.
         FloatingPointError: by the call, when the networks give no plan of a row a finite rating.
         KeyError: by the call, when an input is missing.
 
@@ -75,7 +75,6 @@ class SafeSetFilter(TensorDictModuleBase):
 
     Example:
         >>> from torchrl.data import Bounded
-        >>> from torchrl.modules import RandomPolicy
         >>> from ls3_torchrl import LS3Agent
         >>> spec = Bounded(low=-1.0, high=1.0, shape=(2,))
         >>> planner = LS3Agent(action_spec=spec, latent_dim=8).planner(num_candidates=50, num_elites=5)
@@ -101,6 +100,11 @@ class SafeSetFilter(TensorDictModuleBase):
         reads = [self.action_key] if policy is None else getattr(policy, "in_keys", [])
         self.in_keys = [key for key in dict.fromkeys([*reads, *planner.in_keys]) if key not in written]
         warm = planner.warm_start.out_keys
+        if taken := sorted(str(key) for key in {*self.keys.values(), *warm} & set(written)):
+            raise ValueError(
+                f"Policy and filter would both write {', '.join(taken)}. Give the filter's planner a plan_key, or the "
+                "filter a filter_key, of its own."
+            )
         self.out_keys = list(dict.fromkeys([*written, self.action_key, *self.keys.values(), *warm]))
 
     def make_tensordict_primer(self) -> TensorDictPrimer:

@@ -159,6 +159,9 @@ def test_what_does_not_fit_is_refused():
     other = TensorDictModule(lambda latent: latent, ["latent"], ["wish"])
     with pytest.raises(ValueError, match=r"must write 'action', the planner's action, but TensorDictModule writes"):
         SafeSetFilter(other, planner)
+    with pytest.raises(ValueError, match=r"both write .*'plan', 'mean'.* Give the filter's planner a plan_key"):
+        SafeSetFilter(wall(), planner)
+    SafeSetFilter(wall(), wall(plan_key="filter_plan"))
     with pytest.raises(KeyError, match="action"):
         SafeSetFilter(None, planner)(TensorDict({"latent": torch.zeros(1, D)}, [1]))
     with pytest.raises(ValueError, match=r"must have the shape \[1, 2\], got \[1, 3\]"):
