@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
@@ -20,7 +20,7 @@ from ls3_torchrl.options.training import VAEOptions
 from ls3_torchrl.trainers.checks import require_actions_of
 from ls3_torchrl.trainers.progress import progress_bar
 from ls3_torchrl.trainers.steps import LOG_INTERVAL, is_finite, log_scalars, wants_bf16
-from ls3_torchrl.trainers.vae_gradient import AFTER, TARGET, VAEGradient, in_channel_order, in_memory_order, reordered
+from ls3_torchrl.trainers.vae_gradient import TARGET, VAEGradient, in_channel_order, in_memory_order, reordered
 
 _log = logging.getLogger(__name__)
 PHASE = "VAE"
@@ -103,9 +103,7 @@ class VAETrainer:
         self.device = next(agent.parameters()).device
         self._bf16 = wants_bf16(options.autocast, self.device)
         self._learnt = [parameter for parameter in self._learnt if parameter.requires_grad]
-        self._gradient = VAEGradient(
-            self.loss, self.prediction, self._learnt, observation=buffer.keys.observation, bf16=self._bf16
-        )
+        self._gradient = VAEGradient(self.loss, self.prediction, self._learnt, bf16=self._bf16)
         self.optimizer = torch.optim.Adam(self._gradient.leaves, lr=options.lr, fused=True)
         self.schedule: torch.optim.lr_scheduler.LRScheduler = (
             torch.optim.lr_scheduler.OneCycleLR(self.optimizer, options.lr, total_steps=options.steps, pct_start=0.1)
@@ -201,9 +199,10 @@ class VAETrainer:
         options = self.options
         warmth = warmed_up((self.steps + 1) / options.steps, options.warmup)
         self.loss.beta = options.beta * warmth
-        batch = self._sample()
+        weight = warmth * options.prediction_weight
+        batch = self._sample(predicts=weight > 0.0)
         noise = torch.randn(options.batch_size, self.buffer.latent_dim, device=self.device)
-        losses, value = self._gradient(batch, noise, warmth * options.prediction_weight, both)
+        losses, value = self._gradient(batch, noise, weight, both)
         if not is_finite(self._gradient.leaves, value):
             scalars = {key: item.item() for key, item in losses.items()}
             raise DivergenceError(PHASE, self.steps, scalars, batch, "Lower VAEOptions.lr.")
@@ -211,31 +210,19 @@ class VAETrainer:
         self.schedule.step()
         return losses
 
-    def _sample(self) -> TensorDictBase:
-        """Images to reconstruct and what the encoder sees of them; with a prediction term, also what comes next."""
+    def _sample(self, *, predicts: bool) -> TensorDictBase:
+        """Images of equation (1), from all frames; for the prediction term also what actions lead from and to."""
         options = self.options
-        if self.prediction is None:
-            batch = self.buffer.sample_frames(options.batch_size)
-        else:
+        images = self.buffer.sample_frames(options.batch_size).get(self.buffer.keys.observation)
+        batch = TensorDict({TARGET: self._enlarge(images)}, [options.batch_size])
+        if predicts:
             steps = options.prediction_horizon
-            batch = self.buffer.sample_frame_transitions(
-                options.batch_size, without="after_violation", steps=steps if steps > 1 else None
+            batch.update(
+                self.buffer.sample_frame_transitions(
+                    options.batch_size, without="after_violation", steps=steps if steps > 1 else None
+                )
             )
-        batch = batch.to(self.device)
-        keys = self.buffer.keys
-        images = batch.get(keys.observation)
-        if self.prediction is not None:
-            # Images that violate are the last of all: they only come after an action.
-            after = torch.rand(options.batch_size) < 0.5
-            images = images.clone()
-            images[after] = batch.get(keys.next_observation)[after]
-            batch.set(AFTER, after.to(self.device))
-        target = self._enlarge(images)
-        if target is not images:
-            batch.pop(AFTER, None)
-        if target is not images or self.prediction is not None:
-            batch.set(TARGET, target)
-        return batch
+        return batch.to(self.device)
 
     def _enlarge(self, pixels: Tensor) -> Tensor:
         """Images as if drawn from a dataset that shifts and perspectives have enlarged (section 1.3.4)."""

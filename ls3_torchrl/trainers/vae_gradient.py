@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import Parameter
 from torch.nn.modules.batchnorm import _BatchNorm
@@ -18,9 +18,8 @@ from ls3_torchrl.modules.call import encode, is_hooked
 from ls3_torchrl.modules.vae import as_unit_pixels
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
 
-#: Where a batch holds the images to encode and reconstruct, if not those that came before the action; and which of them
-#: are those that came after it, bool ``[B]``, where they are nothing else.
-TARGET, AFTER = "vae_target", "vae_target_after"
+#: Where a batch holds the images to encode and reconstruct.
+TARGET = "vae_target"
 _Computed = tuple[dict[str, Tensor], tuple[Tensor | None, ...]]
 
 
@@ -35,7 +34,6 @@ class VAEGradient:
         loss: equation (1).
         prediction: its companion, if any.
         parameters: get the gradients.
-        observation: key of the images in a batch.
         bf16: compute under bf16 autocast.
     """
 
@@ -45,11 +43,9 @@ class VAEGradient:
         prediction: LatentPredictionLoss | None,
         parameters: Iterable[Parameter],
         *,
-        observation: NestedKey,
         bf16: bool,
     ) -> None:
-        self.loss, self.prediction, self.parameters = loss, prediction, list(parameters)
-        self.observation, self.bf16 = observation, bf16
+        self.loss, self.prediction, self.parameters, self.bf16 = loss, prediction, list(parameters), bf16
         #: The parameters' values, shared with them, in an order that suits an optimiser; they get the gradients.
         self.leaves = [in_memory_order(parameter) for parameter in self.parameters]
         self._sums = [torch.zeros_like(leaf) for leaf in self.leaves]
@@ -65,7 +61,8 @@ class VAEGradient:
         """Write the gradients of a batch; what the losses write, and the sum that is minimised.
 
         Args:
-            batch: images ``[B, ...]``; with a prediction term also the actions and what comes next.
+            batch: the images to reconstruct ``[B, ...]`` under :data:`TARGET`; for the prediction term also actions,
+                and the images before and after them.
             noise: standard normal ``[B, D]``.
             weight: of the prediction term.
             both: computes the halves.
@@ -98,25 +95,13 @@ class VAEGradient:
 
     def _part(self, batch: TensorDictBase, noise: Tensor, weight: float, share: float) -> _Computed:
         """The losses of a part of a batch times its share in it, and the gradients of their sum."""
-        images = self._in_order(batch.get(self.observation))
-        target = self._in_order(batch.get(TARGET, images))
+        target = self._in_order(batch.get(TARGET))
         with torch.autocast(noise.device.type, torch.bfloat16, enabled=self.bf16, cache_enabled=False):
-            predicts = self.prediction is not None and weight
-            pair: tuple[Tensor, ...] = ()
-            after = batch.get(AFTER, None)
-            if not predicts:
-                loc, scale = self._encode(target)
-            elif after is not None:
-                locs, scales = self._encode(torch.cat([images, self._next(batch)]))
-                pair = locs.chunk(2)
-                loc, scale = (torch.where(after[:, None], new, old) for old, new in (pair, scales.chunk(2)))
-            else:
-                loc, scale = self._encode(target)
-                pair = self._encode(torch.cat([images, self._next(batch)]))[0].chunk(2)
+            loc, scale, *pair = self._posteriors(batch, target, predicts=bool(weight))
             dtype = self.loss.decoder_dtype
             found = self.loss.of_posterior(loc, scale, as_unit_pixels(target, dtype), noise=noise.to(dtype))
             total = found["loss_vae"]
-            if predicts:
+            if pair:
                 assert self.prediction is not None
                 actions = batch.get(self.prediction.tensor_keys.action)
                 found |= self.prediction.of_latents(pair[0], actions, pair[1])
@@ -130,9 +115,15 @@ class VAEGradient:
         ours = type(self.loss.encoder) is PixelEncoder and type(self.loss.decoder) is PixelDecoder
         return images.contiguous(memory_format=torch.channels_last) if ours and images.ndim == 4 else images
 
-    def _next(self, batch: TensorDictBase) -> Tensor:
-        assert self.prediction is not None
-        return batch.get(self.prediction.tensor_keys.next_pixels)
+    def _posteriors(self, batch: TensorDictBase, target: Tensor, *, predicts: bool) -> list[Tensor]:
+        """Means and deviations of the images to reconstruct; and the means before and after the actions."""
+        if self.prediction is None or not predicts:
+            return list(self._encode(target))
+        keys = self.prediction.tensor_keys
+        others = [self._in_order(batch.get(key)) for key in (keys.pixels, keys.next_pixels)]
+        loc, scale = self._encode(torch.cat([target, *others]))
+        loc, before, after = loc.chunk(3)
+        return [loc, scale[: len(target)], before, after]
 
     def _encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
         encoder = self.loss.encoder

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from ls3_torchrl.halves import Halves
 from ls3_torchrl.modules import EnsembleDynamics, PixelDecoder, PixelEncoder
 from ls3_torchrl.objectives import LatentPredictionLoss, VAELoss
-from ls3_torchrl.trainers.vae_gradient import AFTER, TARGET, VAEGradient, in_memory_order
+from ls3_torchrl.trainers.vae_gradient import TARGET, VAEGradient, in_memory_order
 
 D = 4
 
@@ -26,14 +26,9 @@ def images(count):
     return torch.randint(256, (count, 3, 64, 64), dtype=torch.uint8)
 
 
-def batch_of(size, *, targets="before"):
+def batch_of(size):
     rows = {"pixels": images(size), "action": torch.randn(size, 2), "next": {"pixels": images(size)}}
-    if targets == "enlarged":
-        rows[TARGET] = images(size)
-    if targets == "either":
-        rows[AFTER] = torch.arange(size) % 3 == 0
-        rows[TARGET] = torch.where(rows[AFTER][:, None, None, None], rows["next"]["pixels"], rows["pixels"])
-    return TensorDict(rows, [size])
+    return TensorDict({**rows, TARGET: images(size)}, [size])
 
 
 def modules():
@@ -48,7 +43,7 @@ def gradient_of(made, *, bf16=False, reduction="mean"):
     loss = VAELoss(*made[:2], beta=0.1, reduction=reduction)
     parameters = [p for module in made for p in module.parameters()]
     prediction = LatentPredictionLoss(made[0], made[2])
-    return VAEGradient(loss, prediction, parameters, observation="pixels", bf16=bf16)
+    return VAEGradient(loss, prediction, parameters, bf16=bf16)
 
 
 def computed(gradient, batch, noise, weight, cores):
@@ -59,15 +54,14 @@ def computed(gradient, batch, noise, weight, cores):
 
 
 @pytest.mark.parametrize("size", [1, 6, 7])
-@pytest.mark.parametrize("targets", ["before", "enlarged", "either"])
 @pytest.mark.parametrize("reduction", ["mean", "sum"])
-def test_halves_have_the_whole_batchs_losses_and_gradient(size, targets, reduction):
+def test_halves_have_the_whole_batchs_losses_and_gradient(size, reduction):
     made, weight = modules(), 0.7
-    batch, noise = batch_of(size, targets=targets), torch.randn(size, D)
+    batch, noise = batch_of(size), torch.randn(size, D)
     gradient = gradient_of(made, reduction=reduction)
     losses, found = computed(gradient, batch, noise, weight, 2)
     # By the losses as they are called elsewhere, which encode every image by themselves.
-    target = batch.get(TARGET, batch["pixels"])
+    target = batch[TARGET]
     loc, scale = made[0].of_pixels(target)
     whole = gradient.loss.of_posterior(loc, scale, target / 255.0, noise=noise)
     prediction = gradient.prediction(batch)["loss_prediction"]
@@ -81,9 +75,8 @@ def test_halves_have_the_whole_batchs_losses_and_gradient(size, targets, reducti
 
 @pytest.mark.parametrize("bf16", [False, True])
 @pytest.mark.parametrize("weight", [0.0, 1.0])
-@pytest.mark.parametrize("targets", ["before", "either"])
-def test_one_core_and_two_give_the_same_bits(bf16, weight, targets):
-    gradient, batch, noise = gradient_of(modules(), bf16=bf16), batch_of(9, targets=targets), torch.randn(9, D)
+def test_one_core_and_two_give_the_same_bits(bf16, weight):
+    gradient, batch, noise = gradient_of(modules(), bf16=bf16), batch_of(9), torch.randn(9, D)
     (losses, one), (others, two) = (computed(gradient, batch, noise, weight, cores) for cores in (1, 2))
     assert all(torch.equal(losses[name], others[name]) for name in losses)
     for first, second in zip(one, two, strict=True):
@@ -105,8 +98,8 @@ def test_modules_that_look_at_the_whole_batch_are_given_it():
     reader = Reader()
     made = modules()
     made[0] = TensorDictModule(reader, ["camera"], ["loc", "scale"])
-    _, found = computed(gradient_of(made), batch_of(6, targets="either"), torch.randn(6, D), 1.0, 2)
-    assert reader.sizes == [12]  # each image once
+    _, found = computed(gradient_of(made), batch_of(6), torch.randn(6, D), 1.0, 2)
+    assert reader.sizes == [18]  # each image once
     assert all(grad is not None for grad in found)
     made = modules()
     made[0][0].module.convolutions.insert(1, torch.nn.Dropout2d())

@@ -17,7 +17,7 @@ from ls3_recipes.options import as_dict
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.halves import Halves
 from ls3_torchrl.objectives import EnsembleDynamicsLoss, OfflineValueLoss, SafeSetLoss, VAELoss
-from ls3_torchrl.trainers.vae_gradient import VAEGradient
+from ls3_torchrl.trainers.vae_gradient import TARGET, VAEGradient
 
 
 def gradient_step(loss: nn.Module, key: str, rows: TensorDict, precision: str) -> Callable[[], None]:
@@ -36,13 +36,14 @@ def gradient_step(loss: nn.Module, key: str, rows: TensorDict, precision: str) -
 
 def vae_step(loss: VAELoss, rows: TensorDict, precision: str) -> Callable[[], None]:
     """A step on equation (1) as the trainer takes it: half batches on the cores, and Adam."""
-    gradient = VAEGradient(loss, None, loss.parameters(), observation="pixels", bf16=precision == "bf16")
+    gradient = VAEGradient(loss, None, loss.parameters(), bf16=precision == "bf16")
     optimizer = torch.optim.Adam(gradient.leaves, lr=1e-4, fused=True)
     latent_dim = loss.encoder.latent_dim
+    images = TensorDict({TARGET: rows["pixels"]}, rows.batch_size)
 
     def take() -> None:
         with Halves() as both:
-            gradient(rows, torch.randn(len(rows), latent_dim, device=rows.device), 0.0, both)
+            gradient(images, torch.randn(len(rows), latent_dim, device=rows.device), 0.0, both)
             optimizer.step()
 
     return take
