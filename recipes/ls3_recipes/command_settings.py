@@ -95,6 +95,41 @@ class EvaluateSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CalibrateSettings:
+    """Whose thresholds are calibrated, and how.
+
+    Args:
+        run: folder of a finished run of LS³.
+        agent: file in it.
+        alpha: largest shares of violations that may be missed, each in (0, 1).
+        episodes: violating ones to collect; one half finds the thresholds, the other tests them.
+        data: a folder of episodes made by ``ls3 collect``, that the run has not learnt from, in place of these.
+        seed: of the violations, and of how they are halved.
+        device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
+        output: a folder that does not exist yet.
+    """
+
+    run: str
+    agent: str = "agent.pt"
+    alpha: tuple[float, ...] = (0.01, 0.05, 0.1, 0.2)
+    episodes: int = 400
+    data: str | None = None
+    seed: int = 54321
+    device: str = "auto"
+    output: str
+
+    def __post_init__(self) -> None:
+        """Refuse what bounds nothing."""
+        if not self.alpha or not all(0.0 < alpha < 1.0 for alpha in self.alpha):
+            raise ValueError(f"alpha must hold numbers between 0 and 1, such as [0.05,0.1]; got {list(self.alpha)}.")
+        require_at_least(self.episodes, 2, "episodes")
+        require_seed(self.seed)
+        require_device_name(self.device)
+        for name in ("run", "agent", "data", "output"):
+            require_path(getattr(self, name), name)
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReportSettings:
     """What is reported, and where it goes.
 

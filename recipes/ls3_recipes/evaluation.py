@@ -77,14 +77,14 @@ def filtered(
     policy: TensorDictModuleBase, run: Path, planner: PlannerOptions, env: TransformedEnv, device: torch.device
 ) -> SafeSetFilter:
     """The policy behind a filter of the agent of ``run``; the environment carries the filter's plans on."""
-    _require_agent(run / "agent.pt", run)
+    require_agent(run / "agent.pt", run)
     agent = LS3Agent.load(run / "agent.pt").to(device)
     out = SafeSetFilter(policy, agent.planner(env.action_spec, plan_key="filter_plan", **as_dict(planner)))
     env.append_transform(out.make_tensordict_primer())
     return out
 
 
-def _require_agent(file: Path, run: Path) -> None:
+def require_agent(file: Path, run: Path) -> None:
     """Raise ``FileNotFoundError`` for an agent that is not there, with those that are."""
     if file.is_file():
         return
@@ -106,7 +106,7 @@ def _policy(
     algorithm = ALGORITHMS[trained.algorithm].load()(trained, env, device)
     algorithm.prepare(env)
     file = Path(settings.run) / settings.agent
-    _require_agent(file, Path(settings.run))
+    require_agent(file, Path(settings.run))
     algorithm.restore(file)
     return algorithm.policy, algorithm.name, file
 

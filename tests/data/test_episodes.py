@@ -3,7 +3,7 @@ import pytest
 import torch
 from tensordict import LazyStackedTensorDict, TensorDict
 
-from ls3_torchrl.data import EpisodeKeys, episode_from_arrays, split_episodes
+from ls3_torchrl.data import EpisodeKeys, episode_from_arrays, split_episodes, steps_into_violation
 
 T = 4
 KEYS = EpisodeKeys(("agent", "state"), ("agent", "action"), ("next", "r"), ("next", "flags", "hit"), ("next", "there"))
@@ -154,3 +154,15 @@ def test_an_episode_that_its_row_cuts_off_is_refused():
 def test_other_batch_sizes_are_refused():
     with pytest.raises(ValueError, match=r"\[T\] or \[N, T\], got \[1, 1, 3\]"):
         split_episodes(numbered(3)[None, None])
+
+
+def test_of_every_violating_episode_the_step_into_its_first_violation_is_found():
+    episodes = torch.stack([numbered(4)] * 3)
+    constraint = torch.tensor([[0, 1, 0, 1], [0, 0, 0, 0], [0, 0, 0, 1]]).bool()
+    episodes["next", "constraint"] = constraint[..., None]
+    found = steps_into_violation(episodes)
+    assert numbers([found]) == [[1, 3]]
+    with pytest.raises(ValueError, match="None of the episodes violates"):
+        steps_into_violation(episodes[1])
+    with pytest.raises(KeyError):
+        steps_into_violation(episodes, KEYS)

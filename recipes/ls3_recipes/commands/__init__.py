@@ -13,6 +13,7 @@ COMMANDS = {
     "train": "train an agent: demonstrations, offline training, online improvement, evaluation, pictures",
     "collect": "collect a task's offline episodes, to train on later",
     "evaluate": "let a trained agent act, without learning",
+    "calibrate": "find thresholds that miss few violations, and count what they miss",
     "sweep": "carry out many runs: a figure of the paper, or settings of your own",
     "report": "show what several runs say together, on one page",
     "benchmark": "time planning, updates, environments and buffer on this machine",
