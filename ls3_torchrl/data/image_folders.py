@@ -11,11 +11,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from ls3_torchrl._checks import require_choice
 from ls3_torchrl.data.episodes import episode_from_arrays
 from ls3_torchrl.data.keys import EpisodeKeys
 from ls3_torchrl.data.packages import require_package
-from ls3_torchrl.data.pixels import Fit, image_size, pixels_from_images
+from ls3_torchrl.data.pixels import Fit, pixels_from_images, require_image_settings
 
 #: Endings of the files of a folder that are images.
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
@@ -71,8 +70,7 @@ def episode_from_images(
         >>> episode["pixels"].shape, episode["next", "pixels"][:, 0, 0, 0].tolist()
         (torch.Size([10, 3, 64, 64]), [20, 40, 60, 80, 100, 120, 140, 160, 180, 200])
     """
-    image_size(size)
-    require_choice(fit, ("squash", "crop"), "fit")
+    require_image_settings(size, fit)
     files, where = _files(images)
     steps = len(actions)
     if len(files) != steps + 1:

@@ -14,7 +14,7 @@ from tensordict import NestedKey, TensorDictBase
 from ls3_torchrl._checks import DataWarning, require_choice
 from ls3_torchrl.data.keys import EpisodeKeys
 from ls3_torchrl.data.lerobot_files import LeRobotFiles
-from ls3_torchrl.data.pixels import Fit, pixels_from_images
+from ls3_torchrl.data.pixels import Fit, pixels_from_images, require_image_settings
 from ls3_torchrl.data.recordings import (
     Recording,
     Source,
@@ -124,6 +124,7 @@ def load_lerobot(
         >>> loaded[Tag.SUCCESS].batch_size, loaded[Tag.SUCCESS]["next", "state"].flatten().tolist()
         (torch.Size([1, 2]), [0.10000000149011612, 0.30000001192092896])
     """
+    require_image_settings(size, fit)
     require_choice(last, ("drop", "repeat"), "last")
     keys = keys or EpisodeKeys()
     sources = Sources(action, reward, constraint, success, tag, extra or {})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -65,25 +65,21 @@ class LeRobotFiles:
 
     def _episodes(self) -> Iterator[tuple[int, dict[str, Any]]]:
         """What is known of each episode, by number."""
-        meta = self.folder / "meta"
-        if self.info["codebase_version"] == "v3.0":
-            parquet = require_package("pyarrow.parquet", WHO, "pyarrow")
-            paths = sorted((meta / "episodes").glob("*/*.parquet"))
-            rows = (row for path in paths for row in self._without_statistics(parquet, path))
-        else:
-            path = meta / "episodes.jsonl"
-            paths = [path] if path.is_file() else []
-            lines = path.read_text(encoding="utf-8").splitlines() if paths else []
-            rows = (json.loads(line) for line in lines if line.strip())
-        if not paths:
+        meta, newer = self.folder / "meta", self.info["codebase_version"] == "v3.0"
+        paths = sorted((meta / "episodes").glob("*/*.parquet")) if newer else [meta / "episodes.jsonl"]
+        if not paths or not paths[0].is_file():
             raise FileNotFoundError(f"{meta} does not list the episodes: no file of them is there. Use another copy.")
-        for row in rows:
-            yield int(row["episode_index"]), row
-
-    @staticmethod
-    def _without_statistics(parquet: Any, path: Path) -> list[dict[str, Any]]:
-        columns = [name for name in parquet.read_schema(path).names if not name.startswith("stats/")]
-        return parquet.read_table(path, columns=columns).to_pylist()
+        for path in paths:
+            try:
+                lines = [] if newer else path.read_text(encoding="utf-8").splitlines()
+                rows = [json.loads(line) for line in lines if line.strip()]
+                rows = read_table(path, lambda name: not name.startswith("stats/")).to_pylist() if newer else rows
+                numbers = [int(row["episode_index"]) for row in rows]
+            except (KeyError, TypeError, ValueError) as error:
+                raise ValueError(
+                    f"{path} does not list episodes ({error}): it is damaged. Use another copy."
+                ) from error
+            yield from zip(numbers, rows, strict=True)
 
     def columns(self, number: int, camera: str | None) -> dict[str, np.ndarray]:
         """The columns of an episode ``[N, ...]``, without images but those of ``camera`` where they lie beside them.
@@ -92,13 +88,15 @@ class LeRobotFiles:
             FileNotFoundError: when its file is missing.
             ValueError: when it does not hold as many frames as promised.
         """
-        parquet, compute = (require_package(f"pyarrow.{part}", WHO, "pyarrow") for part in ("parquet", "compute"))
+        compute = require_package("pyarrow.compute", WHO, "pyarrow")
         path = self._path("data_path", number, "data")
-        others = {name for name in self.cameras if name != camera}
-        if self._table is None or self._table[:2] != (path, tuple(sorted(others))):
-            names = [name for name in parquet.read_schema(path).names if name not in others]
-            self._table = (path, tuple(sorted(others)), parquet.read_table(path, columns=names))
+        others = tuple(name for name in self.cameras if name != camera)
+        if self._table is None or self._table[:2] != (path, others):
+            self._table = (path, others, read_table(path, lambda name: name not in others))
         table = self._table[2]
+        missing = {"episode_index", "frame_index", "timestamp"} - {*table.column_names}
+        if missing - ({"timestamp"} if camera not in self.cameras else set()):
+            raise ValueError(f"{path} lacks the columns {sorted(missing)}: it is damaged. Use another copy of it.")
         rows = table.filter(compute.equal(table["episode_index"], number)).sort_by("frame_index")
         promised = self.episodes[number].get("length")
         if rows.num_rows == 0 or (promised is not None and rows.num_rows != promised):
@@ -128,7 +126,7 @@ class LeRobotFiles:
             return (self._image(entry, number) for entry in columns[camera])
         path = self._path("video_path", number, f"videos/{camera}", video_key=camera)
         start = float(self.episodes[number].get(f"videos/{camera}/from_timestamp") or 0.0)
-        return video_frames(path, start + columns["timestamp"].astype(np.float64), 0.5 / float(self.info["fps"]))
+        return video_frames(path, start + columns["timestamp"].astype(np.float64), 0.4 / float(self.info["fps"]))
 
     def _image(self, entry: Mapping[str, Any], number: int) -> np.ndarray:
         pillow = require_package("PIL.Image", WHO, "pillow")
@@ -171,6 +169,19 @@ class LeRobotFiles:
         return self.folder / told
 
 
+def read_table(path: Path, wanted: Callable[[str], bool]) -> Any:
+    """Columns of a Parquet file.
+
+    Raises:
+        ValueError: naming the file, when it cannot be read.
+    """
+    parquet = require_package("pyarrow.parquet", WHO, "pyarrow")
+    try:
+        return parquet.read_table(path, columns=[name for name in parquet.read_schema(path).names if wanted(name)])
+    except (OSError, ValueError) as error:  # pyarrow's own errors are among them
+        raise ValueError(f"{path} cannot be read as a table ({error}). Use another copy of it.") from error
+
+
 def video_frames(path: Path, times: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
     """The frames of a video that are shown at ``times`` in seconds, in order; each ``[H, W, 3]`` uint8 RGB.
 
@@ -181,9 +192,12 @@ def video_frames(path: Path, times: np.ndarray, tolerance: float) -> Iterator[np
     try:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
             container.seek(max(int((times[0] - tolerance) / stream.time_base), 0), stream=stream, backward=True)
             wanted = 0
             for frame in container.decode(stream):
+                if frame.time is None:
+                    raise ValueError(f"{path} does not say when its frames are shown. Use another copy of it.")
                 while wanted < len(times) and abs(frame.time - times[wanted]) < tolerance:
                     yield frame.to_ndarray(format="rgb24")
                     wanted += 1

@@ -13,7 +13,7 @@ from tensordict import NestedKey, TensorDictBase
 
 from ls3_torchrl.data.keys import EpisodeKeys, as_tuple
 from ls3_torchrl.data.packages import require_package
-from ls3_torchrl.data.pixels import Channels, Fit, pixels_from_images
+from ls3_torchrl.data.pixels import Channels, Fit, pixels_from_images, require_image_settings
 from ls3_torchrl.data.recordings import (
     Recording,
     Source,
@@ -108,6 +108,7 @@ def load_minari(
         ...     load_minari("mine/robot-v0")[Tag.SUCCESS].batch_size
         torch.Size([1, 9])
     """
+    require_image_settings(64 if size is None else size, fit, channels)
     keys = keys or EpisodeKeys()
     sources = Sources(action, reward, constraint, success, tag, extra or {})
     found = _dataset(dataset)

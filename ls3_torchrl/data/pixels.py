@@ -50,9 +50,7 @@ def pixels_from_images(
         >>> pixels_from_images(video, size=(32, 64), fit="crop", channels="first").shape
         torch.Size([5, 3, 32, 64])
     """
-    require_choice(channels, ("last", "first"), "channels")
-    shape = image_size(size)
-    require_choice(fit, ("squash", "crop"), "fit")
+    shape = require_image_settings(size, fit, channels)
     array = np.asarray(images.cpu() if isinstance(images, Tensor) else images)
     if array.dtype != np.uint8:
         raise TypeError(
@@ -75,13 +73,18 @@ def pixels_from_images(
     return out if several else out[0]
 
 
-def image_size(size: int | tuple[int, int]) -> tuple[int, int]:
-    """Height and width of a setting.
+def require_image_settings(size: int | tuple[int, int], fit: str, channels: str = "last") -> tuple[int, int]:
+    """Check what :func:`pixels_from_images` takes beside images.
+
+    Returns:
+        Height and width.
 
     Raises:
-        ValueError: for anything else than one or two positive whole numbers.
+        ValueError: for a size that is not one or two positive whole numbers, or unknown words.
     """
-    sides = (size, size) if isinstance(size, int) else tuple(size)
+    require_choice(channels, ("last", "first"), "channels")
+    require_choice(fit, ("squash", "crop"), "fit")
+    sides = tuple(size) if isinstance(size, (tuple, list)) else (size, size)
     if len(sides) != 2 or any(not isinstance(side, int) or isinstance(side, bool) or side < 1 for side in sides):
         raise ValueError(f"size must be a positive whole number, or height and width as two of them; got {size!r}.")
     return sides
