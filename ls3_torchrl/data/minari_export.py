@@ -47,7 +47,7 @@ def save_minari(
         keys: where the episodes keep their entries; the defaults of :class:`~ls3_torchrl.data.EpisodeKeys` when
             ``None``.
         about: ``author``, ``author_email``, ``algorithm_name``, ``code_permalink``, ``description``, ``requirements``,
-            ``env`` and ``eval_env``, as ``minari.create_dataset_from_buffers`` takes them.
+            ``env``, ``eval_env`` and ``data_format``, as ``minari.create_dataset_from_buffers`` takes them.
 
     Returns:
         The ``minari.MinariDataset``.
@@ -76,7 +76,9 @@ def save_minari(
     minari = require_package("minari", "save_minari")
     require_package("h5py", "save_minari")
     keys, more = keys or EpisodeKeys(), [unravel_key(key) for key in extra_keys]
-    sets = {tag: checked_rows(rows, keys, tag.name.lower()) for tag, rows in _by_tag(datasets).items()}
+    sets: dict[Tag, list[TensorDictBase]] = {}
+    for tag, some in _by_tag(datasets).items():
+        sets[tag] = checked_rows(some, keys, tag.name.lower())
     rows = [row for some in sets.values() for row in some]
     states = [_states(row, (keys.observation, *more), name) for name, some in _named(sets) for row in some]
     _require_alike(rows, states, keys)
@@ -103,6 +105,10 @@ def save_minari(
 
 
 def _by_tag(datasets: Mapping[Tag, Any]) -> dict[Tag, Any]:
+    if not isinstance(datasets, Mapping):
+        raise TypeError(
+            f"Episodes are saved by tag, got {type(datasets).__name__}. Give a mapping such as {{Tag.SUCCESS: rows}}."
+        )
     if not datasets:
         raise ValueError("There are no episodes to save, got an empty mapping. Give episodes by tag.")
     return {Tag.parse(tag): rows for tag, rows in datasets.items()}
@@ -120,8 +126,8 @@ def _free_folder(dataset_id: str) -> Any:
         parse(dataset_id)
     except (ValueError, TypeError) as error:
         raise ValueError(
-            f"dataset_id must be a name of letters, digits, - and _ with a version, in a namespace or not, such as "
-            f"'mine/robot-v0'; got {dataset_id!r}."
+            "dataset_id must be a name of letters, digits, - and _ with a version, in a namespace of at least two "
+            f"letters or in none, such as 'mine/robot-v0'; got {dataset_id!r}."
         ) from error
     folder = folders.get_dataset_path(dataset_id)
     if folder.exists():
@@ -220,7 +226,7 @@ def _buffer(row: TensorDictBase, states: Mapping[tuple[str, ...], np.ndarray], k
     infos = {}
     for name, key in (("constraint", keys.constraint), ("success", keys.success)):
         flags = row.get(key).flatten().cpu().numpy()
-        infos[name] = np.concatenate([[False], flags])
+        infos[name] = [False, *flags.tolist()]  # a list: Minari does not read arrays of numbers back from Parquet
     return collector.EpisodeBuffer(
         observations=next(iter(states.values())) if len(states) == 1 else _tree(states),
         actions=row.get(keys.action).cpu().numpy(),

@@ -66,7 +66,8 @@ class Sources:
 
         Raises:
             KeyError: for an entry that is not there, or a source that was not given and has no default.
-            ValueError: for another number of values.
+            TypeError: for anything but numbers and bools.
+        ValueError: for another number of values.
         """
         return read_source(recording, getattr(self, what), what)
 
@@ -94,6 +95,8 @@ def read_source(recording: Recording, source: Source | None, what: str) -> np.nd
             f"{recording.steps + 1} states, got shape {list(array.shape)}. Check the function or entry that it is "
             "taken from."
         )
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"{recording.name}: {what} must be numbers or bools, got {array.dtype}. Convert it first.")
     return array
 
 
@@ -135,14 +138,16 @@ def make_episode(
     Raises:
         ValueError: as :func:`~ls3_torchrl.data.check_episodes`; each message names the episode.
     """
-    of_steps = {f"{what}s": sources.of_steps(recording, what) for what in ("action", "reward", "constraint")}
+    labels = [sources.of_steps(recording, what) for what in ("action", "reward", "constraint", "success")]
     try:
-        episode = episode_from_arrays(
-            observations, **of_steps, successes=sources.of_steps(recording, "success"), keys=keys
-        )
+        episode = episode_from_arrays(observations, *labels, keys=keys)
     except ValueError as error:
         raise ValueError(f"{recording.name}: {error}") from error
     for key, source in sources.extra.items():
+        if unravel_key(key) in keys.required or as_tuple(unravel_key(key))[0] == "next":
+            raise ValueError(
+                f"extra= must name keys of its own, none of {keys.required} nor under 'next'; got {key!r}."
+            )
         values = torch.tensor(read_source(recording, source, str(key)))
         if len(values) > recording.steps:
             episode[key], episode[("next", *as_tuple(key))] = values[:-1], values[1:]

@@ -71,6 +71,22 @@ def test_what_is_written_comes_back_bit_by_bit_with_its_tags():
     assert read[Tag.SUCCESS].batch_size[0] == 2
 
 
+@pytest.mark.parametrize("data_format", ["arrow", "parquet"])
+def test_minaris_other_formats_keep_the_bits_too(data_format):
+    save_minari(data(), "mine/robot-v0", data_format=data_format)
+    assert_all_same(data(), load_minari("mine/robot-v0"))
+
+
+def test_tuples_of_observations_are_named_by_their_numbers():
+    both = (np.full((5, 48, 64, 3), 7, dtype=np.uint8), np.zeros((5, 2), dtype=np.float32))
+    space = gymnasium.spaces.Tuple([BOX(0, 255, (48, 64, 3), np.uint8), BOX(-1, 1, (2,))])
+    dataset = foreign(observations=both, space=space)
+    keys = EpisodeKeys(observation="state")
+    assert load_minari(dataset, **LABELS)[Tag.CONSTRAINT]["pixels"].eq(7).all()
+    read = load_minari(dataset, observation=("observations", "1"), keys=keys, **LABELS)
+    assert read[Tag.CONSTRAINT]["state"].shape == (1, 4, 2)
+
+
 def test_states_beside_images_and_own_keys_come_back_too():
     keys = EpisodeKeys(("camera", "image"), ("arm", "action"), ("next", "r"), ("next", "hit"), ("next", "there"))
     written = data(state=True, keys=keys)
@@ -288,6 +304,10 @@ def test_discrete_actions_are_refused_until_a_function_makes_others():
         ({"action": lambda one: one.actions[:, 0]}, ValueError, r"must have shape \[T, A\].*got \[4\]"),
         ({"observation": "cost"}, ValueError, r"Episode 0 .*observations must have shape"),
         ({"observation": lambda one: one.observations[:-1]}, ValueError, "steps need 5 observations, got 4"),
+        ({"success": lambda one: ["no"] * 4}, TypeError, "success must be numbers or bools, got <U2"),
+        ({"success": lambda one: None}, ValueError, r"^Episode 0 of Minari's foreign/push-v0: success must have one"),
+        ({"extra": {"action": "rewards"}}, ValueError, r"extra= must name keys of its own.*got 'action'"),
+        ({"extra": {("next", "cost"): "cost"}}, ValueError, r"got \('next', 'cost'\)"),
         ({"tag": "good"}, ValueError, "Unknown tag 'good'"),
         ({"fit": "pad"}, ValueError, "fit must be one of"),
     ],
