@@ -18,6 +18,8 @@ WHO = "load_lerobot"
 #: The format's versions that are read; 2.0 and 2.1 differ in statistics alone.
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 _IMAGES = ("image", "video")
+#: How a file begins that stands for a large one in a clone without Git LFS.
+_POINTER = b"version https://git-lfs"
 
 
 @dataclass
@@ -160,6 +162,9 @@ class LeRobotFiles:
         path = self._inside(told)
         if not path.is_file():
             raise FileNotFoundError(f"{path} of episode {number} is missing. Download the dataset with all its files.")
+        with path.open("rb") as file:
+            if file.read(len(_POINTER)) == _POINTER:
+                raise ValueError(f"{path} is a pointer of Git LFS, not the file itself. Fetch it with `git lfs pull`.")
         return path
 
     def _inside(self, told: str) -> Path:

@@ -225,6 +225,9 @@ def test_videos_that_are_cut_off_or_lack_frames_are_refused(folder):
     times = [0.0, 0.1, 0.2, 0.3, 0.4, 0.0, 0.1, 0.2, 0.9]  # the last one lies behind the video's end
     with pytest.raises(ValueError, match=r"no frame within 0.04 s of 1.4 s"):
         load_lerobot(changed_columns(folder, timestamp=np.array(times, dtype=np.float32)), camera="top", **LABELS)
+    video.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1530\n")
+    with pytest.raises(ValueError, match=r"file-000.mp4 is a pointer of Git LFS.*git lfs pull"):
+        load_lerobot(folder, camera="top", **LABELS)
     video.unlink()
     with pytest.raises(FileNotFoundError, match=r"file-000.mp4 of episode 0 is missing"):
         load_lerobot(folder, camera="top", **LABELS)
