@@ -4,7 +4,7 @@ from ls3_torchrl.data.augment import random_perspective
 from ls3_torchrl.data.buffer import TaggedReplayBuffer
 from ls3_torchrl.data.conform import check_datasets
 from ls3_torchrl.data.dataset import check_episodes, load_episodes, save_episodes
-from ls3_torchrl.data.episodes import episode_from_arrays, split_episodes
+from ls3_torchrl.data.episodes import episode_from_arrays, split_episodes, steps_into_violation
 from ls3_torchrl.data.image_folders import episode_from_images
 from ls3_torchrl.data.keys import EpisodeKeys
 from ls3_torchrl.data.labels import (
@@ -50,5 +50,6 @@ __all__ = [
     "save_episodes",
     "save_minari",
     "split_episodes",
+    "steps_into_violation",
     "timed_out",
 ]

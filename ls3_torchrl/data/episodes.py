@@ -189,3 +189,34 @@ def done_steps(row: TensorDictBase) -> Tensor | None:
     flags = [row.get(key, None) for key in _ENDS]
     told = [flag.reshape(len(row), -1).any(1).cpu() for flag in flags if flag is not None]
     return torch.stack(told).any(0) if told else None
+
+
+def steps_into_violation(episodes: Episodes, keys: EpisodeKeys | None = None) -> TensorDictBase:
+    """Of every episode that violates, the step whose next state is the first to do so.
+
+    Args:
+        episodes: as :func:`split_episodes` takes them.
+        keys: of the labels; the defaults when ``None``.
+
+    Returns:
+        ``[n]``.
+
+    Raises:
+        KeyError: for episodes without the label.
+        ValueError: when none violates.
+
+    Example:
+        >>> constraint = torch.tensor([[False], [True], [True]])
+        >>> episode = TensorDict({"action": torch.arange(3.0)[:, None], "next": {"constraint": constraint}}, [3])
+        >>> steps_into_violation([episode, episode])["action"].flatten().tolist()
+        [1.0, 1.0]
+    """
+    key = (keys or EpisodeKeys()).constraint
+    found = []
+    for episode in split_episodes(episodes):
+        violates = episode[key].flatten().nonzero()
+        if len(violates):
+            found.append(episode[int(violates[0])])
+    if not found:
+        raise ValueError("None of the episodes violates a constraint. Give violating ones.")
+    return torch.stack(found)

@@ -1,5 +1,6 @@
 """Planning: the learned model as an environment, the optimiser, the scores, and LS³'s controller."""
 
+from ls3_torchrl.planners.calibration import Calibration, calibrate, conformal_threshold, foresee
 from ls3_torchrl.planners.cem import CrossEntropyMethod
 from ls3_torchrl.planners.decisions import describe_plan
 from ls3_torchrl.planners.fused import FusedImagination
@@ -12,6 +13,7 @@ from ls3_torchrl.planners.scoring import PlanStatistics, feasible, least_harm, o
 from ls3_torchrl.planners.warm_start import WarmStart
 
 __all__ = [
+    "Calibration",
     "CrossEntropyMethod",
     "FusedImagination",
     "ImaginationNoise",
@@ -26,9 +28,12 @@ __all__ = [
     "RolloutImagination",
     "SafeSetFilter",
     "WarmStart",
+    "calibrate",
+    "conformal_threshold",
     "describe_filter",
     "describe_plan",
     "feasible",
+    "foresee",
     "least_harm",
     "objective",
 ]
