@@ -26,7 +26,7 @@ NEEDED = (
     "ls3_recipes/py.typed",
 )
 EXTRAS = ("hydra", "omegaconf", "gymnasium", "mujoco", "mujoco_warp", "cv2", "matplotlib", "PIL", "rich", "tensorboard")
-EXTRAS += ("av", "scipy")
+EXTRAS += ("av", "scipy", "minari", "pyarrow", "h5py")
 
 
 def check_archives(folder: Path) -> None:

@@ -55,10 +55,10 @@ def check_episodes(
         >>> episode = episode_from_arrays(torch.zeros(10, 4), torch.zeros(9, 2), -torch.ones(9), no, no, keys=keys)
         >>> check_episodes([episode], keys=keys)
     """
-    _checked(episodes, keys or EpisodeKeys(), name)
+    checked_rows(episodes, keys or EpisodeKeys(), name)
 
 
-def _checked(episodes: TensorDictBase | list[TensorDictBase], keys: EpisodeKeys, name: str) -> list[TensorDictBase]:
+def checked_rows(episodes: TensorDictBase | list[TensorDictBase], keys: EpisodeKeys, name: str) -> list[TensorDictBase]:
     """Episodes ``[T_i]`` in the form that is kept."""
     rows = _rows(episodes, name)
     for number, row in enumerate(rows):
@@ -139,7 +139,7 @@ def save_episodes(
     sets: dict[str, list[TensorDictBase]] = {}
     for tag, episodes in datasets.items():
         name = Tag.parse(tag).name.lower()
-        sets[name] = rows = _checked(episodes, keys or EpisodeKeys(), name)
+        sets[name] = rows = checked_rows(episodes, keys or EpisodeKeys(), name)
         _require_tensors(rows, name)
     with new_folder(folder) as new:
         description = {

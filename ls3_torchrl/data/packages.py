@@ -1,0 +1,31 @@
+"""Packages that only some data need."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+
+def require_package(name: str, who: str, package: str | None = None) -> Any:
+    """A module of a package that the library itself can do without.
+
+    Args:
+        name: of the module, such as ``"PIL.Image"``.
+        who: who asks, for messages.
+        package: what to install where that is not called as the module; the module's first name when ``None``.
+
+    Returns:
+        The module.
+
+    Raises:
+        ModuleNotFoundError: when it cannot be imported, naming what to install.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        wanted = package or name.partition(".")[0]
+        raise ModuleNotFoundError(
+            f"{who} needs {wanted}, which cannot be imported ({error}). Install what data of one's own need: "
+            "pip install 'ls3-torchrl[data]'.",
+            name=error.name or wanted,
+        ) from error
