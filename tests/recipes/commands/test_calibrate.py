@@ -6,8 +6,7 @@ import shutil
 import pytest
 import torch
 
-from ls3_recipes.calibration import calibrate_run
-from ls3_recipes.command_settings import CalibrateSettings
+from ls3_recipes.commands.calibrate import CalibrateSettings, calibrate
 from ls3_recipes.configuration import compose_settings
 from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag, load_episodes, save_episodes, steps_into_violation
@@ -15,7 +14,7 @@ from ls3_torchrl.planners import foresee
 
 
 def calibrated(*arguments):
-    return calibrate_run(compose_settings("calibrate", CalibrateSettings, ["device=cpu", *arguments]))
+    return calibrate(compose_settings("calibrate", CalibrateSettings, ["device=cpu", *arguments]))
 
 
 @pytest.fixture
