@@ -10,7 +10,16 @@ import pytest
 import torch
 
 from ls3_envs import ReacherEnv
-from ls3_envs.reacher import FINGER_RADIUS, GOAL, OBSTACLE, OBSTACLE_RADIUS, finger_position, reacher_model
+from ls3_envs.reacher import (
+    FINGER_RADIUS,
+    GOAL,
+    NEARNESS,
+    OBSTACLE,
+    OBSTACLE_RADIUS,
+    START,
+    finger_position,
+    reacher_model,
+)
 
 
 def test_the_finger_is_where_mujoco_has_it():
@@ -116,6 +125,8 @@ def test_random_starts_are_safe_and_differ():
     assert not first["constraint"].any()
     assert first["state"][:, :2].std(0).min() > 0.5
     assert (first["state"][:, 2:] == 0).all()
+    near = ((first["state"][:, :2] - torch.tensor(START)).abs() <= NEARNESS + 1e-6).all(-1)
+    assert 0.3 < near.float().mean() < 0.7  # half of them, and hardly any by chance
 
 
 def test_goal_and_stay_out_disc_are_drawn_where_they_count():
