@@ -10,6 +10,7 @@ import torch
 from ls3_recipes.algorithms import ALGORITHMS
 from ls3_recipes.benchmark.suite import BenchmarkSettings
 from ls3_recipes.command_settings import SweepSettings
+from ls3_recipes.commands.calibrate import CalibrateSettings
 from ls3_recipes.commands.collect import CollectSettings
 from ls3_recipes.commands.evaluate import EvaluateSettings
 from ls3_recipes.commands.report import ReportSettings
@@ -23,6 +24,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 SETTINGS = {
+    "calibrate": CalibrateSettings,
     "collect": CollectSettings,
     "evaluate": EvaluateSettings,
     "report": ReportSettings,
