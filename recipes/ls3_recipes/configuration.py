@@ -19,7 +19,7 @@ from ls3_recipes.arguments import config_dir, name_in, split_arguments
 from ls3_recipes.composition import composed, reason
 from ls3_recipes.console import command_line
 from ls3_recipes.extra import Job
-from ls3_recipes.options import build, defaults
+from ls3_recipes.options import build, defaults, require_sections
 from ls3_recipes.overrides import CONF, GROUPS, check, choices_of
 from ls3_recipes.relevance import prune, refuse_irrelevant, refuse_unread
 from ls3_recipes.renamed import RENAMED, on_command_line, rename_overrides, rename_settings
@@ -93,7 +93,9 @@ def settings_from(
     try:
         values = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:
-        if missing := _missing(OmegaConf.to_container(config, resolve=False)):
+        values = _named(OmegaConf.to_container(config, resolve=False))
+        require_sections(settings, values)
+        if missing := _missing(values):
             raise ValueError(f"{missing[0]} must be given: it has no default.") from None
         raise ValueError(f"These settings make no configuration: {reason(error)}") from error
     named = rename_settings(_named(values), renamed, explicit={name_in(override) for override in overrides})

@@ -109,6 +109,21 @@ def defaults(settings: type) -> dict[str, Any]:
     return out
 
 
+def require_sections(settings: type, values: Mapping[str, Any], where: str = "") -> None:
+    """Raise ``ValueError`` for a single value where settings have a section.
+
+    Args:
+        settings: a class of settings.
+        values: by name.
+        where: the section that they stand in.
+    """
+    prefix = f"{where}." if where else ""
+    for key in sections(settings).keys() & values.keys():  # type: ignore[arg-type]
+        if not isinstance(values[key], Mapping):
+            shown = "null" if values[key] is None else repr(values[key])
+            raise ValueError(f"{prefix}{key} is a section, got {shown}: set {prefix}{key}.KEY=VALUE.")
+
+
 def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
     """A dataclass, and those within, from a nested mapping.
 
@@ -136,12 +151,10 @@ def build(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
     for key in values:
         if key not in names:
             raise ValueError(unknown(key, names, where, [prefix + name for name in leaves(settings)]))
+    require_sections(settings, values, where)
     arguments: dict[str, Any] = {}
     for key, value in values.items():
         if key in nested:
-            if not isinstance(value, Mapping):
-                shown = "null" if value is None else repr(value)
-                raise ValueError(f"{prefix}{key} is a section, got {shown}: set {prefix}{key}.KEY=VALUE.")
             arguments[key] = build(nested[key], value, prefix + key)
         elif value != MISSING:
             arguments[key] = typed(value, hints[key], prefix + key)

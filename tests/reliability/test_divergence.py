@@ -67,7 +67,7 @@ def test_a_rate_that_is_far_too_large_stops_its_phase_at_the_step(tmp_path, phas
     assert str(kept) in error.__notes__[0]
     state = torch.load(kept / "state.pt", weights_only=True)
     assert finite(state["state"])  # the bad step was not taken
-    assert set(state["batch"]) & {"latent", "pixels", "action"}
+    assert set(state["batch"]) & {"latent", "vae_target", "action"}
 
 
 @pytest.fixture
