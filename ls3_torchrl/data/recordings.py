@@ -67,7 +67,7 @@ class Sources:
         Raises:
             KeyError: for an entry that is not there, or a source that was not given and has no default.
             TypeError: for anything but numbers and bools.
-        ValueError: for another number of values.
+            ValueError: for another number of values.
         """
         return read_source(recording, getattr(self, what), what)
 

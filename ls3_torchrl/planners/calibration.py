@@ -118,7 +118,7 @@ def calibrate(planner: LS3Planner, violations: TensorDictBase, alpha: float) -> 
         alpha: α in (0, 1).
 
     Raises:
-        ValueError: as :func:`conformal_threshold`, and where an estimator is certain of the contrary for more than α.
+        ValueError: as :func:`conformal_threshold`, and where an estimator is certain of the contrary too often for α.
 
     Source: :func:`conformal_threshold`.
 
@@ -136,7 +136,7 @@ def calibrate(planner: LS3Planner, violations: TensorDictBase, alpha: float) -> 
     for name, certain in (("constraint estimator", constraint < 0.0), ("safe set", safe_set > 1.0)):
         if certain:
             raise ValueError(
-                f"The {name} is certain that more than {alpha:.0%} of the violations are none: no threshold finds "
-                "them. Train it longer or on more violations, or take a larger alpha."
+                f"The {name} is certain that some of the violations are none, too many of them for alpha={alpha}: no "
+                "threshold finds these. Train it longer or on more violations, or take a larger alpha."
             )
     return Calibration(alpha, len(violations), constraint, safe_set)

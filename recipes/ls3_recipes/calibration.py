@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +34,12 @@ def calibrate_run(settings: CalibrateSettings) -> dict[str, Any]:
 
     Returns:
         What is written to ``summary.json``: for every α the thresholds, the shares of violations missed by each, and
-        the share of steps before a violation that δ_C takes for one.
+        the share of steps before a violation that δ_C takes for one; or, under ``not_found``, why there are none.
 
     Raises:
         FileNotFoundError: when ``run`` is no run's folder, or has no such agent.
         FileExistsError: when the output folder exists.
-        ValueError: for a run of another algorithm, data of another task, or too few violations.
+        ValueError: for a run of another algorithm, data of another task, or when no α has thresholds.
     """
     device, trained = choose_device(settings.device), settings_of_run(settings.run)
     if not isinstance(trained, LS3Settings):
@@ -53,7 +54,7 @@ def calibrate_run(settings: CalibrateSettings) -> dict[str, Any]:
     known, new = steps_into_violation(episodes[:half]), steps_into_violation(episodes[half:])
     test = foresee(planner, new.to(device)).cpu()
     calm = _foresee(planner, torch.cat([_before_violation(episode) for episode in episodes[half:]]), device)
-    levels = [_level(planner, known.to(device), alpha, test, calm) for alpha in settings.alpha]
+    levels, not_found = _levels(planner, known.to(device), settings.alpha, test, calm)
     folder = RunFolder.make(settings.output, as_dict(settings))
     summary: dict[str, Any] = {
         "task": trained.task.name,
@@ -63,6 +64,7 @@ def calibrate_run(settings: CalibrateSettings) -> dict[str, Any]:
         "found_on": len(known),
         "tested_on": len(new),
         "levels": levels,
+        "not_found": not_found,
         "hardware": hardware(device),
     }
     failed = draw({"calibration.png": lambda: plot_calibration(folder.path / "calibration.png", levels, test, calm)})
@@ -90,6 +92,21 @@ def _before_violation(episode: TensorDictBase) -> TensorDictBase:
 
 def _foresee(planner: LS3Planner, steps: TensorDictBase, device: torch.device) -> TensorDict:
     return torch.cat([foresee(planner, part.to(device)).cpu() for part in steps.split(512)])
+
+
+def _levels(
+    planner: LS3Planner, known: TensorDictBase, alphas: Sequence[float], test: TensorDictBase, calm: TensorDictBase
+) -> tuple[list[dict[str, float]], dict[str, str]]:
+    """The thresholds for each α that has any, and why the others have none."""
+    levels, not_found = [], {}
+    for alpha in alphas:
+        try:
+            levels.append(_level(planner, known, alpha, test, calm))
+        except ValueError as error:
+            not_found[f"{alpha:g}"] = str(error)
+    if not levels:
+        raise ValueError(" ".join(not_found.values()))
+    return levels, not_found
 
 
 def _level(
@@ -125,4 +142,6 @@ def _print(summary: dict[str, Any], folder: Path) -> None:
             f"{level['missed_by_safe_set']:.1%}",
         )
     console.print(table)
+    for alpha, reason in summary["not_found"].items():
+        console.print(f"alpha={alpha}: {reason}", markup=False)
     console.print(f"Everything is in {folder}", markup=False, soft_wrap=True)

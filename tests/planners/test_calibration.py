@@ -91,9 +91,11 @@ def test_a_planner_foresees_with_its_own_particles_and_noise():
 
 def test_estimators_that_are_certain_of_the_contrary_are_refused():
     never = classifier(ConstraintEstimator, slope=1000.0, offset=1.0)
-    with pytest.raises(ValueError, match=r"The constraint estimator is certain that more than 10% .* are none"):
+    with pytest.raises(
+        ValueError, match=r"The constraint estimator is certain that some .* too many of them for alpha=0\.1"
+    ):
         calibrate(stub_planner(constraint=never), steps([0.0] * 19), alpha=0.1)
-    with pytest.raises(ValueError, match=r"The safe set is certain that more than 10% .* are none"):
+    with pytest.raises(ValueError, match=r"The safe set is certain that some .* too many of them for alpha=0\.1"):
         calibrate(stub_planner(safe_set=classifier(SafeSet, slope=1000.0, offset=-1.0)), steps([0.0] * 19), alpha=0.1)
 
 

@@ -45,6 +45,14 @@ def test_thresholds_are_found_on_one_half_and_tested_on_the_other(easy_run, tmp_
     assert strict["false_alarms"] > 0.5  # an estimator that knows nothing pays for it
 
 
+def test_a_level_without_thresholds_costs_the_others_nothing(easy_run, tmp_path, capsys):
+    summary = calibrated(f"run={easy_run}", "alpha=[0.001,0.3]", "episodes=40", f"output={tmp_path / 'some'}")
+    assert [level["alpha"] for level in summary["levels"]] == [0.3]
+    assert list(summary["not_found"]) == ["0.001"]
+    assert "needs 999 violations at least" in summary["not_found"]["0.001"]
+    assert "alpha=0.001: " in capsys.readouterr().out
+
+
 def test_episodes_of_ones_own_calibrate_as_well(easy_run, tmp_path):
     violating = load_episodes(easy_run / "demonstrations")[Tag.CONSTRAINT]
     several = torch.cat([violating] * 12)
