@@ -25,6 +25,7 @@ MAY_IMPORT = {
     "files": set(),
     "halves": {"_memory"},
     "agent": {"_checks", "files", "modules", "options", "planners"},
+    "deployment": {"_checks", "agent", "data", "modules", "options"},
     "trainers": {
         "_checks",
         "_memory",

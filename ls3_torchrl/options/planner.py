@@ -5,7 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ls3_torchrl._values import require_at_least, require_choice, require_not_negative, require_probability
+from ls3_torchrl._values import (
+    require_at_least,
+    require_choice,
+    require_not_negative,
+    require_positive,
+    require_probability,
+)
 
 SafeSetReduction = Literal["mean", "min"]
 EngineName = Literal["auto", "fused", "rollout"]
@@ -32,6 +38,7 @@ class ControlOptions:
     max_relaxations: int = 5
     safe_set_reduction: SafeSetReduction = "mean"
     noise_scale: float = 1.0
+    max_ms: float | None = None
     engine: EngineName = "auto"
     precision: Precision = "auto"
 
@@ -44,6 +51,8 @@ class ControlOptions:
                 require_probability(getattr(self, name), name)
         require_at_least(self.max_relaxations, 0, "max_relaxations")
         require_not_negative(self.noise_scale, "noise_scale")
+        if self.max_ms is not None:
+            require_positive(self.max_ms, "max_ms")
         require_choice(self.engine, ("auto", "fused", "rollout"), "engine")
         require_choice(self.precision, ("auto", "fp32", "bf16"), "precision")
         require_choice(self.safe_set_reduction, ("mean", "min"), "safe_set_reduction")

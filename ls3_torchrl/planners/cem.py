@@ -175,9 +175,9 @@ class CrossEntropyMethod:
             elites = self._select(actions, scores)
             self._keep_best(search, rows, elites)
             self._refit(search, rows, elites)
-            self._restart(search, rows[elites.restart], max_restarts)
-            if scores.enough is not None:
-                search.step[rows[scores.enough & elites.feasible]] = self.optim_steps
+            ended = torch.zeros_like(elites.restart) if scores.enough is None else scores.enough
+            self._restart(search, rows, elites.restart, ended | (search.restarts[rows] >= max_restarts))
+            search.step[rows[ended]] = self.optim_steps
             rows = rows[search.step[rows] < self.optim_steps]
             iteration += 1
         return search.result()
@@ -230,10 +230,9 @@ class CrossEntropyMethod:
         search.mean[rows[refitted]] = mean[refitted]
         search.std[rows[refitted]] = std[refitted]
 
-    def _restart(self, search: _Search, rows: Tensor, max_restarts: int) -> None:
-        """These rows start again, or are done when they have done so ``max_restarts`` times."""
-        exhausted = search.restarts[rows] >= max_restarts
-        again, done = rows[~exhausted], rows[exhausted]
+    def _restart(self, search: _Search, rows: Tensor, restart: Tensor, last: Tensor) -> None:
+        """Of the rows, those of ``restart`` start again, or are done where this start was the last."""
+        again, done = rows[restart & ~last], rows[restart & last]
         search.restarts[again] += 1
         search.step[again] = 0
         search.mean[again], search.std[again] = search.start_mean[again], search.start_std[again]

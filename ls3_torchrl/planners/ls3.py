@@ -26,6 +26,7 @@ from ls3_torchrl.options.planner import (
     SafeSetReduction,
 )
 from ls3_torchrl.planners.cem import optimizer_or_default
+from ls3_torchrl.planners.deadline import Deadline
 from ls3_torchrl.planners.decisions import Decisions
 from ls3_torchrl.planners.engine import Engine
 from ls3_torchrl.planners.imagination import (
@@ -91,6 +92,10 @@ class LS3Planner(MPCPlannerBase):
         noise_scale: factor on the dynamics' learnt standard deviation, at least 0; 1 is the paper. With 0 the
             particles differ by their members alone. Where latents are samples of wide posteriors, most of that
             deviation is the posteriors' own, and with few particles it drowns what tells one plan from another.
+        max_ms: milliseconds that a plan may take, the encoder's time with it; ``None`` for as long as the optimiser
+            needs. When no further round fits in, the best feasible plan so far is acted on, or else the safest, and
+            ``("plan", "iterations")`` is the smaller. The first round always ends: choose fewer candidates where it
+            takes too long by itself. With a limit, plans depend on the speed of the machine.
         engine: ``"fused"`` runs a snapshot of the networks; ``"rollout"`` runs ``LatentEnv.rollout`` and takes
             any modules; ``"auto"`` the first wherever it bypasses no module, which is looked at before each plan.
         precision: of the fused engine.
@@ -148,6 +153,7 @@ class LS3Planner(MPCPlannerBase):
         max_relaxations: int = 5,
         safe_set_reduction: SafeSetReduction = "mean",
         noise_scale: float = 1.0,
+        max_ms: float | None = None,
         engine: EngineName = "auto",
         precision: Precision = "auto",
         action_key: NestedKey = "action",
@@ -168,13 +174,14 @@ class LS3Planner(MPCPlannerBase):
             max_relaxations=max_relaxations,
             safe_set_reduction=safe_set_reduction,
             noise_scale=noise_scale,
+            max_ms=max_ms,
             engine=engine,
             precision=precision,
         )
         self.horizon, self.num_particles = horizon, num_particles
         self.safe_set_threshold, self.constraint_threshold = safe_set_threshold, constraint_threshold
         self.relaxation, self.max_relaxations = float(relaxation), max_relaxations
-        self.noise_scale = noise_scale
+        self.noise_scale, self.max_ms = noise_scale, max_ms
         self.value, self.safe_set, self.encoder = value, safe_set, encoder
         self._require_modules()
         self.engine = Engine(
@@ -292,6 +299,8 @@ class LS3Planner(MPCPlannerBase):
         mean: Tensor | None = None,
         std: Tensor | None = None,
         noise: PlanNoise | None = None,
+        *,
+        deadline: Deadline | None = None,
     ) -> OptimizerResult:
         """Plan from latents, the tensors' way.
 
@@ -300,13 +309,14 @@ class LS3Planner(MPCPlannerBase):
             mean: mean of the first round's Gaussian, ``[B, H, A]``.
             std: its standard deviation.
             noise: all randomness; drawn when ``None``.
+            deadline: when to end; ``max_ms`` from now on when ``None``.
         """
         relaxations = 0 if self.safe_set_threshold is None else self.max_relaxations
 
         def rate(statistics: PlanStatistics, threshold: Tensor, _actions: Tensor, _rows: Tensor) -> PlanScores:
             return self.score_plans(statistics, threshold)
 
-        return self.search(latent, rate, relaxations, mean, std, noise)
+        return self.search(latent, rate, relaxations, mean, std, noise, deadline=deadline)
 
     @torch.no_grad()
     def search(
@@ -319,6 +329,8 @@ class LS3Planner(MPCPlannerBase):
         noise: PlanNoise | None = None,
         *,
         first: Tensor | None = None,
+        deadline: Deadline | None = None,
+        reserve: int = 0,
     ) -> OptimizerResult:
         """Search for plans that are rated otherwise than by their value.
 
@@ -331,7 +343,11 @@ class LS3Planner(MPCPlannerBase):
             std: as in :meth:`plan`.
             noise: as in :meth:`plan`.
             first: the action ``[B, A]`` with which every plan begins, whatever is searched for the steps after it.
+            deadline: as in :meth:`plan`.
+            reserve: rounds of a later search that must end before the deadline, too.
         """
+        deadline = Deadline(self.max_ms) if deadline is None else deadline
+        deadline.begin_round()
         latent, imagine, space = latent.float(), self.imagine, self.action_spec.space
 
         def score(actions: Tensor, rows: Tensor, restarts: Tensor, iteration: int) -> PlanScores:
@@ -346,7 +362,9 @@ class LS3Planner(MPCPlannerBase):
             statistics = imagine(latent[rows], actions, sampled, limits)
             scores = rate(statistics, threshold, actions, rows)
             require_sound(statistics, scores)
-            return scores
+            if deadline.leaves_time(1 + reserve):
+                return scores
+            return scores._replace(enough=torch.ones_like(rows, dtype=torch.bool))
 
         def given(rows: Tensor, iteration: int) -> tuple[Tensor, ...]:
             assert noise is not None
@@ -380,12 +398,13 @@ class LS3Planner(MPCPlannerBase):
         noise: PlanNoise | None = None,
     ) -> TensorDictBase:
         """Plan for every row and write action, decisions and the next step's warm start."""
+        deadline = Deadline(self.max_ms)
         out = tensordict if tensordict_out is None else tensordict_out
         latent = self.encode(tensordict)
         batch = latent.shape[:-1]
         rows = batch.numel()
         mean, std = self.read_warm_start(tensordict, rows)
-        result = self.plan(latent.reshape(rows, latent.shape[-1]), mean, std, noise)
+        result = self.plan(latent.reshape(rows, latent.shape[-1]), mean, std, noise, deadline=deadline)
         require_finite(result.actions, f"The plan of {type(self.optimizer).__name__}")
         space = self.action_spec.space
         # Once more, in the spec's own dtype: a bound of it may lie between two numbers of float32.

@@ -18,8 +18,8 @@ class PlanScores(NamedTuple):
         fallback: ranking ``[b, N]``, higher is better, for rows in which nothing is feasible.
         restart: bool ``[b]``, rows that are to start again under easier conditions where nothing is feasible; all of
             them when ``None``. The others go on among sequences that are not feasible, by their fallback ranking.
-        enough: bool ``[b]``, rows whose best feasible sequence needs no improvement: their search may end. None of them
-            when ``None``.
+        enough: bool ``[b]``, rows whose search ends here with the best that was found: it needs no improvement, or time
+            is up. None of them when ``None``.
     """
 
     score: Tensor

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import TensorDictPrimer
 
 from ls3_torchrl._checks import require_finite, require_keys
+from ls3_torchrl.planners.deadline import Deadline
 from ls3_torchrl.planners.ls3 import LS3Planner
 from ls3_torchrl.planners.optimizer import PlanScores
 from ls3_torchrl.planners.scoring import PlanStatistics
@@ -52,8 +53,8 @@ class SafeSetFilter(TensorDictModuleBase):
     Args:
         policy: any module that writes the planner's ``action_key``, or any function from a tensordict to one, such as
             TorchRL's ``RandomPolicy``; ``None`` where the tensordict holds the action already, a person's for example.
-        planner: whose model, thresholds and optimiser are used. With ``safe_set_threshold=None`` plans may end
-            anywhere, as in a filter of H steps without a terminal set.
+        planner: whose model, thresholds and optimiser are used, and ``max_ms`` for the policy and all plans together.
+            With ``safe_set_threshold=None`` plans may end anywhere, as in a filter of H steps without a terminal set.
         filter_key: group under which is written what was decided.
 
     Returns:
@@ -114,6 +115,7 @@ class SafeSetFilter(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action that is carried out, and what was decided."""
         planner = self.planner
+        deadline = Deadline(planner.max_ms)
         out = tensordict if self.policy is None else self.policy(tensordict)
         require_keys(out, [self.action_key], "SafeSetFilter")
         latent, wanted = planner.encode(out), out.get(self.action_key)
@@ -127,14 +129,16 @@ class SafeSetFilter(TensorDictModuleBase):
         proposed = wanted.to(spec.dtype).clamp(spec.space.low, spec.space.high)
         rows = batch.numel()
         warm = planner.read_warm_start(out, rows)
-        verdict = self._judge(latent.reshape(rows, -1), proposed.reshape(rows, -1).float(), *warm)
+        verdict = self._judge(latent.reshape(rows, -1), proposed.reshape(rows, -1).float(), *warm, deadline)
         chosen = verdict.action.to(spec.dtype).clamp(spec.space.low, spec.space.high).reshape(proposed.shape)
         action = torch.where(verdict.certified.reshape(*batch, 1), proposed, chosen)
         self._write(out, verdict, proposed, action)
         planner.warm_start.write(out, verdict.mean, verdict.std)
         return out.set(self.action_key, action)
 
-    def _judge(self, latent: Tensor, proposed: Tensor, mean: Tensor | None, std: Tensor | None) -> _Verdict:
+    def _judge(
+        self, latent: Tensor, proposed: Tensor, mean: Tensor | None, std: Tensor | None, deadline: Deadline
+    ) -> _Verdict:
         """Of latents ``[B, D]`` and proposed actions ``[B, A]``."""
         planner, limit = self.planner, self.planner.constraint_limit
         avoidable = torch.zeros(len(latent), dtype=torch.bool, device=latent.device)
@@ -145,7 +149,7 @@ class SafeSetFilter(TensorDictModuleBase):
             enough = scores.feasible.any(-1)
             return scores._replace(score=statistics.safe_set_prob, restart=torch.zeros_like(enough), enough=enough)
 
-        kept = planner.search(latent, certify, 0, mean, std, first=proposed)
+        kept = planner.search(latent, certify, 0, mean, std, first=proposed, deadline=deadline, reserve=1)
         certified = ~kept.fallback
         left = kept.fallback.nonzero().flatten()
         if not len(left):
@@ -156,7 +160,8 @@ class SafeSetFilter(TensorDictModuleBase):
             distance = self._distance(actions[:, :, 0], proposed[left[rows], None])
             return scores._replace(score=-distance, restart=torch.zeros_like(scores.feasible[:, 0]))
 
-        found = planner.search(latent[left], nearest, 0, *self._around(proposed[left], mean, std, left))
+        start = self._around(proposed[left], mean, std, left)
+        found = planner.search(latent[left], nearest, 0, *start, deadline=deadline)
         action = proposed.index_copy(0, left, found.actions[:, 0])
         feasible = certified.index_copy(0, left, ~found.fallback)
         new_mean, new_std = kept.mean.index_copy(0, left, found.mean), kept.std.index_copy(0, left, found.std)

@@ -87,6 +87,7 @@ NUMBERS = {
             "policy.alpha",
             "policy.initial_std",
             "checkpoint_minutes",
+            "planner.max_ms",
             "policy.lr",
             "policy.temperature",
             "vae.lr",
@@ -127,7 +128,7 @@ PAIRS = {"vae.warmup"}
 TEXTS = {"algorithm", "preset", "device", "output"}
 PATHS = {"data", "scratch_dir", "vae.checkpoint", "output"}
 OR_NULL = {"data", "output", "scratch_dir", "vae.checkpoint", "vae.warmup"}
-OR_NULL |= {"planner.constraint_threshold", "planner.safe_set_threshold", "tracker"}
+OR_NULL |= {"planner.constraint_threshold", "planner.max_ms", "planner.safe_set_threshold", "tracker"}
 
 
 def is_whole(value, low):
