@@ -46,8 +46,8 @@ class ReacherDemonstrator(Scripted):
 class ReacherViolator(Scripted):
     """A PD controller that steers the finger to some place in the stay-out disc, from random starts.
 
-    Place and gain are each episode's own: with the same ones, all arms would come into the disc slowly and, at each place,
-    from the same side, where an agent comes from its start, fast, on the way to the goal.
+    Place and gain are each episode's own: with the same ones, all arms would come into the disc slowly and, at each
+    place, from the same side, where an agent comes from its start, fast, on the way to the goal.
 
     Use it with ``ReacherEnv(start="random")``.
 
