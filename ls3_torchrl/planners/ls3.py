@@ -92,10 +92,10 @@ class LS3Planner(MPCPlannerBase):
         noise_scale: factor on the dynamics' learnt standard deviation, at least 0; 1 is the paper. With 0 the
             particles differ by their members alone. Where latents are samples of wide posteriors, most of that
             deviation is the posteriors' own, and with few particles it drowns what tells one plan from another.
-        max_ms: milliseconds that a plan may take, the encoder's time with it; ``None`` for as long as the optimiser
-            needs. When no further round fits in, the best feasible plan so far is acted on, or else the safest, and
-            ``("plan", "iterations")`` is the smaller. The first round always ends: choose fewer candidates where it
-            takes too long by itself. With a limit, plans depend on the speed of the machine.
+        max_ms: milliseconds that a plan may take, the encoder's time with it unless it is compiled; ``None`` for as
+            long as the optimiser needs. When no further round fits in, the best feasible plan so far is acted on, or
+            else the safest, and ``("plan", "iterations")`` is the smaller. The first round always ends: choose fewer
+            candidates where it takes too long by itself. With a limit, plans depend on the speed of the machine.
         engine: ``"fused"`` runs a snapshot of the networks; ``"rollout"`` runs ``LatentEnv.rollout`` and takes
             any modules; ``"auto"`` the first wherever it bypasses no module, which is looked at before each plan.
         precision: of the fused engine.
@@ -398,7 +398,8 @@ class LS3Planner(MPCPlannerBase):
         noise: PlanNoise | None = None,
     ) -> TensorDictBase:
         """Plan for every row and write action, decisions and the next step's warm start."""
-        deadline = Deadline(self.max_ms)
+        # No compiled graph looks at a clock: there, time counts from the search on.
+        deadline = None if torch.compiler.is_compiling() else Deadline(self.max_ms)
         out = tensordict if tensordict_out is None else tensordict_out
         latent = self.encode(tensordict)
         batch = latent.shape[:-1]
