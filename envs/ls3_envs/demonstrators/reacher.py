@@ -8,10 +8,7 @@ import torch
 from torch import Tensor
 
 from ls3_envs.demonstrators.scripted import Scripted
-from ls3_envs.reacher import LINK, OBSTACLE, OBSTACLE_RADIUS, START
-
-#: Lowest and highest gain of the violators' controllers, torque per radian.
-GAINS = (1.5, 6.0)
+from ls3_envs.reacher import LINK, OBSTACLE, START
 
 
 class ReacherDemonstrator(Scripted):
@@ -44,16 +41,13 @@ class ReacherDemonstrator(Scripted):
 
 
 class ReacherViolator(Scripted):
-    """A PD controller that steers the finger to some place in the stay-out disc, from random starts.
-
-    Place and gain are each episode's own: with the same ones, all arms would come into the disc slowly and, at each
-    place, from the same side, where an agent comes from its start, fast, on the way to the goal.
+    """A PD controller that steers the finger into the stay-out disc, from random starts.
 
     Use it with ``ReacherEnv(start="random")``.
 
     Args:
         noise_std: standard deviation of the noise on the torques.
-        seed: seed of places, gains and noise.
+        seed: seed of that noise.
 
     Example:
         >>> from torchrl.envs import InitTracker, TransformedEnv
@@ -67,17 +61,15 @@ class ReacherViolator(Scripted):
         super().__init__(limit=1.0, noise_std=noise_std, seed=seed)
 
     def _act(self, state: Tensor, step: Tensor, is_init: Tensor) -> Tensor:
-        radius, angle = OBSTACLE_RADIUS * self._uniform(state, 1).sqrt(), self._uniform(state, 1, 0.0, 2 * math.pi)
-        place = state.new_tensor(OBSTACLE) + torch.cat([radius * angle.cos(), radius * angle.sin()], -1)
-        x, y = self._for_the_episode("place", place, is_init).split(1, -1)
-        gain = self._for_the_episode("gain", self._uniform(state, 1, *GAINS), is_init)
-        # The posture that reaches it (law of cosines), on the side that the elbow bends to now.
-        angle = ((x**2 + y**2 - 2 * LINK**2) / (2 * LINK**2)).acos()
+        # The disc's centre by the elbow's angle (law of cosines), on the side that the elbow bends to now.
+        x, y = OBSTACLE
+        reach = math.hypot(x, y)
+        angle = math.acos((reach**2 - 2 * LINK**2) / (2 * LINK**2))
         bend = torch.where(state[:, 1:2] < 0, -angle, angle)
-        shoulder = torch.atan2(y, x) - torch.atan2(bend.sin(), 1 + bend.cos())
+        shoulder = math.atan2(y, x) - torch.atan2(bend.sin(), 1 + bend.cos())
         error = torch.cat([shoulder, bend], -1) - state[:, :2]
         error[:, :1] = torch.remainder(error[:, :1] + math.pi, 2 * math.pi) - math.pi  # the nearer way round
-        return gain * error - 0.3 * state[:, 2:]
+        return 1.5 * error - 0.3 * state[:, 2:]
 
 
 class ReacherWanderer(Scripted):
