@@ -1,17 +1,15 @@
 """The document on own data does what it says: its Python runs as it stands."""
 
-import re
 import shutil
 import warnings
 from pathlib import Path
 
+import documents
 from PIL import Image
 
 from ls3_torchrl.data import Tag
 
 ROOT = Path(__file__).parents[1]
-DOCUMENT = ROOT / "docs" / "own_data.md"
-BLOCKS = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 def test_the_document_on_own_data_runs(tmp_path, monkeypatch):
@@ -22,12 +20,10 @@ def test_the_document_on_own_data_runs(tmp_path, monkeypatch):
     for t in range(21):
         Image.new("RGB", (320, 240), (10 * t, 0, 0)).save(run / f"img_{t}.png")
     shutil.copytree(ROOT / "tests" / "data" / "lerobot_v3", tmp_path / "recordings" / "push")
-    names: dict = {}
-    for block in BLOCKS:
-        with warnings.catch_warnings():
-            # What Minari itself says of a dataset without an author.
-            warnings.filterwarnings("ignore", message=".*is set to None|env_spec is None")
-            exec(compile(block, DOCUMENT.name, "exec"), names)
+    with warnings.catch_warnings():
+        # What Minari itself says of a dataset without an author.
+        warnings.filterwarnings("ignore", message=".*is set to None|env_spec is None")
+        names = documents.run("own_data.md")
     assert list(names["foreign"]) == [Tag.CONSTRAINT]
     assert list(names["robot"]) == [Tag.SUCCESS, Tag.CONSTRAINT]
     assert len(names["buffer"]) == 20 + 20 + 8 + 7

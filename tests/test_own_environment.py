@@ -1,20 +1,18 @@
 """The document on own environments does what it says: its Python runs as it stands, and the agent learns."""
 
 import re
-from pathlib import Path
 
+import documents
 import pytest
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "own_environment.md"
-BLOCKS = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), flags=re.DOTALL)
+BLOCKS = documents.python_blocks("own_environment.md")
 
 
 @pytest.mark.slow
 def test_an_agent_learns_on_an_environment_that_this_project_does_not_own(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    names: dict = {}
     training, *others = BLOCKS
-    exec(compile(training, DOCUMENT.name, "exec"), names)
+    names = documents.run("own_environment.md", [training])
     episodes = [line for line in capsys.readouterr().out.splitlines() if " steps, violation: " in line]
     lengths = [int(line.split()[0]) for line in episodes]
     demonstrated = names["buffer"].transitions.storage[:]
@@ -23,8 +21,7 @@ def test_an_agent_learns_on_an_environment_that_this_project_does_not_own(tmp_pa
     # Every episode reaches the top, sooner than the demonstrations that violated nothing, and none goes too far back.
     assert sum(lengths[-3:]) / 3 < 0.9 * mean_length(first)
     assert not any("violation: True" in line for line in episodes)
-    for block in others:
-        exec(compile(block, DOCUMENT.name, "exec"), names)
+    documents.run("own_environment.md", others, names)
     assert names["again"].horizon == 12
     assert len(names["buffer"]) == len(demonstrated) + 2 * names["steps"]
     assert names["robot"].foreign == ("encoder",)

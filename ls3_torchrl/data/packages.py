@@ -1,4 +1,4 @@
-"""Packages that only some data need."""
+"""Packages that the library itself can do without."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from importlib import import_module
 from typing import Any
 
 
-def require_package(name: str, who: str, package: str | None = None) -> Any:
+def require_package(name: str, who: str, package: str | None = None, *, extra: str = "data") -> Any:
     """A module of a package that the library itself can do without.
 
     Args:
         name: of the module, such as ``"PIL.Image"``.
         who: who asks, for messages.
         package: what to install where that is not called as the module; the module's first name when ``None``.
+        extra: of ``ls3-torchrl``, that brings it along.
 
     Returns:
         The module.
@@ -25,7 +26,7 @@ def require_package(name: str, who: str, package: str | None = None) -> Any:
     except ImportError as error:
         wanted = package or name.partition(".")[0]
         raise ModuleNotFoundError(
-            f"{who} needs {wanted}, which cannot be imported ({error}). Install what data of one's own need: "
-            "pip install 'ls3-torchrl[data]'.",
+            f"{who} needs {wanted}, which cannot be imported ({error}). Install it: "
+            f"pip install 'ls3-torchrl[{extra}]'.",
             name=error.name or wanted,
         ) from error

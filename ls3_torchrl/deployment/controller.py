@@ -130,7 +130,8 @@ class Controller:
             raise ValueError(f"The controller takes one image at a time, got {len(pixels)}. Call it once for each.")
         self._seen.extend([pixels] * (self._seen.maxlen or 1) if is_init else [pixels])
         # Rows of one: policies are made for batches.
-        entry = TensorDict({"is_init": torch.full((1, 1), is_init)}, [1], device=self.device).update(self._carried)
+        entry = TensorDict({"is_init": torch.full((1, 1), is_init)}, [1], device=self.device)
+        entry.update(self._carried.copy())  # what the policy adds to a group stays out of what was carried
         entry.set(self._pixels_key, torch.cat(list(self._seen)[:: self.frame_stride]).unsqueeze(0))
         for name, value in inputs.items():
             entry.set(name, torch.as_tensor(value).unsqueeze(0))

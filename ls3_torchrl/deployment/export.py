@@ -7,7 +7,6 @@ import json
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -18,6 +17,7 @@ from torch import Tensor, nn
 
 from ls3_torchrl._checks import require_choice
 from ls3_torchrl.agent import LS3Agent
+from ls3_torchrl.data.packages import require_package
 from ls3_torchrl.modules.call import call_on_latent, encode
 from ls3_torchrl.modules.classifiers import probability_of
 from ls3_torchrl.modules.dynamics import EnsembleDynamics
@@ -116,7 +116,7 @@ def export_modules(agent: LS3Agent, folder: str | Path, *, format: Format = "tor
             "Export them by torch.export.export, and with this function an agent whose modules are its own."
         )
     if format == "onnx":
-        _require_onnx()
+        require_package("onnxscript", "format='onnx'", extra="deployment")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     files, parts = {}, _parts(agent)
@@ -181,17 +181,6 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
-
-
-def _require_onnx() -> None:
-    try:
-        import_module("onnxscript")
-    except ImportError as error:
-        raise ModuleNotFoundError(
-            f"format='onnx' needs onnxscript, which cannot be imported ({error}). Install what deployment needs: "
-            "pip install 'ls3-torchrl[deployment]'.",
-            name=error.name or "onnxscript",
-        ) from error
 
 
 def _describe(agent: LS3Agent, parts: dict[str, _Part], files: dict[str, Path]) -> dict[str, Any]:

@@ -94,6 +94,22 @@ def test_the_planner_goes_on_from_its_last_plan():
     assert rows[1]["plan", "iterations"].item() >= 1
 
 
+def test_a_reset_leaves_nothing_of_the_last_episode():
+    policy, seen = agent().planner(**SMALL), []
+
+    def watched(td):
+        seen.append(sorted(map(str, td.keys(True, True))))
+        return policy(td)
+
+    watched_module = TensorDictSequential(policy)
+    watched_module.forward = watched
+    controller = Controller(watched_module)
+    controller.act(grey(10))
+    controller.reset()
+    controller.act(grey(20))
+    assert seen[-1] == seen[0] == ["('plan', 'mean')", "('plan', 'std')", "is_init", "pixels"]
+
+
 def test_a_person_acts_through_the_filter():
     shield = SafeSetFilter(None, agent().planner(**SMALL))
     with pytest.raises(KeyError, match="needs the keys"):

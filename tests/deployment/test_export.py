@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 from tensordict import TensorDict
@@ -63,12 +64,11 @@ def test_exported_modules_give_what_the_agent_gives(tmp_path, options):
 
 
 def test_onnx_gives_what_the_agent_gives(tmp_path):
-    runtime = pytest.importorskip("onnxruntime")
     made = agent(control_affine=True)
     described = None
     for name, path in export_modules(made, tmp_path, format="onnx").items():
         described = described or json.loads((tmp_path / "modules.json").read_text())["modules"]
-        session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
         assert [i.name for i in session.get_inputs()] == list(described[name]["inputs"])
         assert [o.name for o in session.get_outputs()] == list(described[name]["outputs"])
         for rows in (1, 7):
