@@ -11,14 +11,15 @@ ARGS ?=
 # Threads that wait must not burn the cores that others compute on.
 export OMP_WAIT_POLICY = passive
 
-.PHONY: help run test soak smoke lint types package check lock clean
+.PHONY: help run test soak smoke lint types docs package check lock clean
 
 help:
 	@echo "make run    train LS3 on Navigation from pixels; pictures and figures land in runs/"
 	@echo "            (TASK=navigation PRESET=cpu|paper|smoke SEED=0 ARGS='key=value ...')"
 	@echo "make test   install what the tests need and run them"
 	@echo "make soak   the long form of the tests of reliability: kill, signals, full disks, memory; about an hour"
-	@echo "make check  package, tests, lint, format, types and the smoke recipe: what CI runs"
+	@echo "make docs   build the documentation site in build/docs; a warning is an error"
+	@echo "make check  package, tests, lint, format, types, docs and the smoke recipe: what CI runs"
 	@echo "make lock   write constraints.txt anew from this environment"
 
 $(VENV)/run.installed: pyproject.toml constraints.txt
@@ -47,13 +48,16 @@ lint: $(VENV)/test.installed
 types: $(VENV)/test.installed
 	$(BIN)/mypy
 
+docs: $(VENV)/test.installed
+	$(BIN)/python -m sphinx --fresh-env --fail-on-warning --keep-going --quiet --builder html docs build/docs
+
 smoke: $(VENV)/run.installed
 	$(BIN)/python recipes/ls3.py preset=smoke
 
 package:
 	PYTHON=$(PYTHON) .ci/package
 
-check: package test lint types smoke
+check: package test lint types docs smoke
 
 lock: $(VENV)/test.installed
 	$(BIN)/python -m pip freeze --exclude-editable > constraints.txt

@@ -232,7 +232,7 @@ class VisualConstraintEnv(EnvBase):
     def random_state(self) -> list[dict]:
         """The random streams of all environments, as they stood before each one's last reset; numbers and names only.
 
-        After :meth:`set_random_state` of it, :meth:`reset` begins the same episodes again.
+        After :meth:`set_random_state` of it, ``reset`` begins the same episodes again.
         """
         return list(self._streams)
 

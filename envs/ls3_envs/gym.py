@@ -141,7 +141,7 @@ class GymEnv(gymnasium.Env):
     and change nothing. Episodes end by truncation alone; steps after the end stay truncated until a reset.
 
     Args:
-        domain: a name in :data:`ls3_envs.DOMAINS`.
+        domain: a name in ``ls3_envs.DOMAINS``.
         render_mode: ``None`` or ``"rgb_array"``.
         render_size: side of rendered frames in pixels, 8 to 1024, for videos; observations stay as they are. As large
             as these when ``None``.
@@ -210,7 +210,7 @@ class GymVectorEnv(VectorEnv):
     goes under the same seed. Every key of ``info`` has its mask, ``_constraint`` beside ``constraint``.
 
     Args:
-        domain: a name in :data:`ls3_envs.DOMAINS`.
+        domain: a name in ``ls3_envs.DOMAINS``.
         num_envs: N.
         render_mode: ``None`` or ``"rgb_array"``.
         render_size: side of rendered frames in pixels, as for :class:`GymEnv`.

@@ -43,7 +43,8 @@ def check_episodes(
         ValueError: for a wrong batch shape, wrong image shape, observations that differ in shape or type from those
             after them, data that are not finite, or rows that hold padding or more than one episode.
         TypeError: when the images are not uint8.
-        Further: as the buffer refuses an episode.
+
+    It also raises whatever the buffer refuses an episode with.
 
     Warns:
         DataWarning: naming what the buffer would convert.
@@ -131,7 +132,8 @@ def save_episodes(
         FileExistsError: when the folder exists.
         TypeError: for entries that are not tensors.
         OSError: naming the file, when it cannot be written, as on a full disk; then nothing is left.
-        Further: as :func:`check_episodes`.
+
+    It also raises what :func:`~ls3_torchrl.data.check_episodes` does.
     """
     folder = Path(folder)
     if folder.exists():

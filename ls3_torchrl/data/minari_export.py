@@ -57,7 +57,8 @@ def save_minari(
         FileExistsError: when there is such a dataset.
         ValueError: for an id without version, actions outside of the spec, or observations that were taken anew for
             each step, for which Minari has no room.
-        Further: as :func:`~ls3_torchrl.data.check_episodes`. When anything fails, nothing is left.
+
+    It also raises what :func:`~ls3_torchrl.data.check_episodes` does. When anything fails, nothing is left.
 
     Source:
         Minari 0.5, https://minari.farama.org.

@@ -38,7 +38,7 @@ class BatchStream:
         change: what is made of batches ``[K, *batch]`` when they are drawn, all at once; it keeps their shape.
 
     Returns:
-        From the call: ``[B]``, or ``[B, M]``, or either with K behind for stretches of ``steps=K``.
+        A call returns rows ``[B]``, or ``[B, M]``, or either with K behind for stretches of ``steps=K``.
 
     Raises:
         RuntimeError: by the call, without encoder or without rows of the selection.

@@ -117,7 +117,7 @@ class Controller:
                 encoder of your own needs.
 
         Returns:
-            One row, without batch dimension: the policy's keys, such as ``action`` and ``("plan", "fallback")``.
+            The policy's keys, such as ``action`` and ``("plan", "fallback")``, without a batch dimension.
 
         Raises:
             TypeError: for an image that is not uint8.

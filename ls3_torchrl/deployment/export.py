@@ -75,14 +75,13 @@ def export_modules(agent: LS3Agent, folder: str | Path, *, format: Format = "tor
     A monitor beside another controller, for example, needs the encoder, f_C and f_S alone. Every file takes batches of
     any size B, computes in float32, and is deterministic:
 
-    | file | takes | gives |
-    |---|---|---|
-    | ``encoder`` | ``pixels`` uint8 ``[B, C, 64, 64]`` | ``loc``, ``scale`` ``[B, D]``: q(z|s) of equation (1) |
-    | ``dynamics`` | ``latent`` ``[B, D]``, ``action`` ``[B, A]`` | ``loc``, ``scale`` ``[B, M, D]`` of each member |
-    | ``value`` | ``latent`` | ``state_value`` ``[B, M, 1]``: V of equation (3), (4) |
-    | ``safe_set`` | ``latent`` | ``safe_set_prob`` ``[B, 1]``: f_S of equation (5) |
-    | ``constraint`` | ``latent`` | ``constraint_prob`` ``[B, 1]``: f_C |
-    | ``goal`` | ``latent`` | ``goal_prob`` ``[B, 1]``: f_G |
+    - ``encoder`` takes ``pixels`` uint8 ``[B, C, 64, 64]``, gives ``loc``, ``scale`` ``[B, D]``: q(z|s) of equation (1)
+    - ``dynamics`` takes ``latent`` ``[B, D]``, ``action`` ``[B, A]``, gives ``loc``, ``scale``
+      ``[B, M, D]`` of each member
+    - ``value`` takes ``latent``, gives ``state_value`` ``[B, M, 1]``: V of equation (3), (4)
+    - ``safe_set`` takes ``latent``, gives ``safe_set_prob`` ``[B, 1]``: f_S of equation (5)
+    - ``constraint`` takes ``latent``, gives ``constraint_prob`` ``[B, 1]``: f_C
+    - ``goal`` takes ``latent``, gives ``goal_prob`` ``[B, 1]``: f_G
 
     Args:
         agent: whose; it is not changed.

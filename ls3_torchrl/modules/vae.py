@@ -193,7 +193,7 @@ class PixelDecoder(TensorDictModuleBase):
     Args:
         out_channels: C, 3 × stacked frames.
         latent_dim: D.
-        background: add the network's output to a fixed image, :attr:`background` ``[C, 64, 64]``, black until
+        background: add the network's output to a fixed image, ``background`` ``[C, 64, 64]``, black until
             :meth:`set_background` is called. With the mean image, the network need not learn it before it sees what
             moves. The paper has none.
         latent_key: where latents ``[*B, D]`` are read.

@@ -18,7 +18,7 @@ from ls3_torchrl.modules.call import Weights
 
 
 class LatentLoss(LossModule):
-    """Base class of a loss: a subclass declares its keys in ``_AcceptedKeys`` and computes :meth:`losses`.
+    """Base class of a loss: a subclass declares its keys in ``_AcceptedKeys`` and computes ``losses``.
 
     ``in_keys`` are the accepted keys, as ``set_keys`` left them. A loss is called with a tensordict, or with tensors as
     keyword arguments, named by their keys, with an underscore between the parts of a nested key. It then returns the
@@ -110,7 +110,7 @@ class LatentLoss(LossModule):
 
     @dispatch(source="_keyword_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The scalars of :attr:`out_keys`, as a tensordict without batch dimension."""
+        """The scalars of ``out_keys``, as a tensordict without batch dimension."""
         require_keys(tensordict, self.in_keys, type(self).__name__)
         return TensorDict(self.losses(tensordict), batch_size=torch.Size([]))
 
@@ -120,7 +120,7 @@ class LatentLoss(LossModule):
 
     @property
     def is_plain(self) -> bool:
-        """Whether a call does nothing but compute :meth:`losses`: no hooks, no other ``forward``."""
+        """Whether a call does nothing but compute ``losses``: no hooks, no other ``forward``."""
         checks = [hook for hook in self._forward_pre_hooks.values() if not hook.__module__.startswith("torchrl.")]
         hooks = checks, self._forward_hooks, self._backward_pre_hooks, self._backward_hooks
         return self._has_plain_forward and not (any(hooks) or "forward" in vars(self))

@@ -106,7 +106,7 @@ class LS3Planner(MPCPlannerBase):
         optimizer_settings: of the default optimiser, such as ``num_candidates=200``; see ``CrossEntropyMethod``.
 
     Returns:
-        From the call: the tensordict with ``action``, and under ``plan`` ``feasible``, ``fallback``, ``relaxed``,
+        A call returns the tensordict with ``action``, and under ``plan`` ``feasible``, ``fallback``, ``relaxed``,
         ``safe_set_threshold`` (the δ_S acted on, 0 for none), ``score``, ``iterations``, all ``[*B, 1]``; under
         ``("next", "plan")`` the warm start ``mean`` and ``std`` ``[*B, H, A]``. ``out_keys`` name all of these.
         ``in_keys`` name what is read: the observation, and if the optimiser uses it, the warm start and ``is_init``.
@@ -233,7 +233,7 @@ class LS3Planner(MPCPlannerBase):
 
     @property
     def imagine(self) -> Imagination:
-        """What imagines plans now: modules may have been exchanged, or hooked, since the last plan."""
+        """What imagines plans now; modules may have been exchanged, or hooked, since the last plan."""
         return self.engine.choose((self.env, self.value, self.safe_set))
 
     def sample_noise(self, batch: int) -> PlanNoise:
@@ -288,7 +288,7 @@ class LS3Planner(MPCPlannerBase):
 
     @property
     def constraint_limit(self) -> float:
-        """δ_C as a number: no probability exceeds 1."""
+        """δ_C as a number, 1 for none, which no probability exceeds."""
         return 1.0 if self.constraint_threshold is None else float(self.constraint_threshold)
 
     @torch.compiler.disable  # a search with data-dependent ends, over threads of its own: nothing to trace

@@ -58,7 +58,7 @@ class SafeSetFilter(TensorDictModuleBase):
         filter_key: group under which is written what was decided.
 
     Returns:
-        From the call: what ``policy`` writes, with the ``action`` that is carried out, and under ``filter``
+        A call returns what ``policy`` writes, with the ``action`` that is carried out, and under ``filter``
         ``proposed`` ``[*B, A]``, the policy's action within its bounds; each ``[*B, 1]``, ``intervened``, whether
         another is carried out, and why: ``constraint``, every plan found that starts with it violates, or
         ``safe_set``, those that do not all end outside the safe set; ``feasible``, whether a feasible plan starts with

@@ -90,7 +90,7 @@ class Learner:
 
     @property
     def is_independent(self) -> bool:
-        """Whether all its random numbers are its own: batches from streams, and no dropout in its networks."""
+        """Whether all its random numbers are its own, with batches from streams and no dropout in its networks."""
         return bool(self.streams) and not any(isinstance(module, _DropoutNd) for module in self.loss.modules())
 
     @property
