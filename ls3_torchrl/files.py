@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -21,12 +22,13 @@ _NO_ROOM = 16 * 2**20
 _FOLDER = 0x10
 
 
-def save_atomically(content: Any, path: str | Path) -> Path:
+def save_atomically(content: Any, path: str | Path, *, compress: bool = False) -> Path:
     """``torch.save`` in one go: a half-written file never takes the place of a whole one.
 
     Args:
         content: what to save.
         path: where; its folder is made.
+        compress: in less space, which takes longer; ``torch.load`` reads such files as well.
 
     Returns:
         The path.
@@ -39,7 +41,17 @@ def save_atomically(content: Any, path: str | Path) -> Path:
     """
     import torch  # here: texts, folders and full disks need none of it
 
-    return _write_atomically(path, lambda file: torch.save(content, file))
+    def write(file: IO[bytes]) -> None:
+        if not compress:
+            torch.save(content, file)
+            return
+        whole = io.BytesIO()
+        torch.save(content, whole)
+        with zipfile.ZipFile(whole) as parts, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+            for part in parts.infolist():
+                packed.writestr(part.filename, parts.read(part), compresslevel=9)
+
+    return _write_atomically(path, write)
 
 
 def save_json_atomically(content: dict[str, Any], path: str | Path) -> Path:

@@ -254,3 +254,37 @@ def test_a_save_that_fails_leaves_the_file_before_it_and_nothing_else(path, save
 def test_a_file_can_be_moved(path, saved, tmp_path):
     shutil.move(path, tmp_path / "elsewhere.pt")
     assert same(saved[0], load(tmp_path / "elsewhere.pt"))
+
+
+def test_a_compact_file_holds_what_acts_and_no_more(tmp_path):
+    torch.manual_seed(0)
+    agent = LS3Agent(action_spec=Bounded(-1.0, 1.0, shape=(2,)), latent_dim=4, planner={"horizon": 3}, background=True)
+    whole, small = agent.save(tmp_path / "whole.pt"), agent.save(tmp_path / "small.pt", compact=True)
+    assert small.stat().st_size < 0.3 * whole.stat().st_size
+    loaded = LS3Agent.load(small)
+    assert loaded.decoder is None
+    assert loaded.planner().horizon == 3
+    for name, weight in loaded.state_dict().items():
+        before = agent.state_dict()[name]
+        assert weight.dtype == before.dtype
+        assert torch.equal(weight, before.to(torch.bfloat16).float() if before.is_floating_point() else before)
+    again = loaded.save(tmp_path / "again.pt", compact=True)
+    assert same(LS3Agent.load(again), loaded)
+
+
+def test_a_compact_file_asks_for_no_decoder_from_outside(tmp_path):
+    decoder = TensorDictModule(torch.nn.Linear(D, 3), ["latent"], ["reco_state"])
+    agent = LS3Agent(1, encoder=encoder(), decoder=decoder, latent_dim=D)
+    assert load(agent.save(tmp_path / "small.pt", compact=True)).foreign == ("encoder",)
+    with pytest.raises(ValueError, match="modules from outside: decoder, encoder"):
+        load(agent.save(tmp_path / "whole.pt"))
+
+
+@pytest.mark.parametrize("where", [0.1, 0.5, 0.9])
+def test_damage_to_a_compact_file_is_found(tmp_path, where):
+    path = tiny_agent().save(tmp_path / "small.pt", compact=True)
+    content = bytearray(path.read_bytes())
+    content[int(where * len(content))] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"small\.pt"):
+        load(path)

@@ -58,9 +58,10 @@ class EvaluateSettings:
 
     Args:
         run: folder of a finished run.
-        agent: file in it.
+        agent: file in it; without ``run``, the task whose agent comes with this package.
         policy: ``"trained"``, the run's own, or ``"random"``, uniform actions on its task.
-        filter: folder of a run of LS³ on the same task, whose model lets the policy's actions through or replaces them
+        filter: folder of a run of LS³ on the same task, or that task's name for the agent that comes with this
+            package; its model lets the policy's actions through or replaces them
             (:class:`~ls3_torchrl.planners.SafeSetFilter`); ``None`` for none.
         episodes: side by side.
         seed: of the environments.

@@ -48,6 +48,7 @@ MAY_IMPORT["collection"] = LOWEST | {"command_settings", "rollout", "run_files"}
 MAY_IMPORT["evaluation"] = LOWEST | {"algorithms", "command_settings", "configuration", "plots", "rollout"}
 MAY_IMPORT["evaluation"] |= {"run_files", "run_folder", "run_settings"}
 MAY_IMPORT["calibration"] = MAY_IMPORT["evaluation"] | {"evaluation"}
+MAY_IMPORT["shipped"] = {"arguments"}
 MAY_IMPORT["commands"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"commands"}
 MAY_IMPORT["__init__"] = set()

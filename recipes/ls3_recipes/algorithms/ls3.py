@@ -102,7 +102,10 @@ class LS3(Algorithm):
 
     def restore(self, path: Path) -> None:
         """Take the networks of such a file; one of another shape, or with actions in other units, is refused."""
-        self.agent.load_state_dict(LS3Agent.load(path, **asdict(self.agent.architecture)).state_dict())
+        loaded = LS3Agent.load(path, **asdict(self.agent.architecture))
+        if loaded.decoder is None:  # a compact file
+            self.agent.decoder = None
+        self.agent.load_state_dict(loaded.state_dict())
 
     def pictures(self, folder: Path, offline: dict[Tag, TensorDictBase], evaluation: TensorDictBase) -> Pictures:
         """Reconstructions, timelines, and maps and plans where the states are a plane."""

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from ls3_recipes.command_settings import CalibrateSettings
 from ls3_recipes.configuration import register, run_command, settings_of_run
 from ls3_recipes.extra import Job
+from ls3_recipes.shipped import with_shipped_agents
 
 HELP = """
 Find δ_C and δ_S of a trained agent so that a share alpha of violations is missed at most (split conformal prediction):
@@ -28,7 +29,7 @@ calibrate = Job("ls3 calibrate", "ls3_recipes.calibration:calibrate_run")
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = with_shipped_agents("calibrate", sys.argv[1:] if arguments is None else arguments)
     run_command("calibrate", CalibrateSettings, _calibrate, arguments, help_text=HELP)
 
 

@@ -1,0 +1,56 @@
+"""Agents that come with the package: one for each domain, to look at, start from, or filter with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ls3_recipes.arguments import name_in
+
+FOLDER = Path(__file__).with_name("agents")
+#: Episodes of a shipped agent unless others are asked for: those that the film shows, within seconds.
+IN_FILM = 6
+
+
+def shipped_agents() -> dict[str, Path]:
+    """The folder of each, by the name of its task: ``agent.pt``, the settings of its run, and a card.
+
+    Example:
+        >>> sorted(shipped_agents())[0]
+        'cable_routing'
+    """
+    return {path.parent.name: path.parent for path in sorted(FOLDER.glob("*/agent.pt"))}
+
+
+def with_shipped_agents(command: str, arguments: Sequence[str]) -> list[str]:
+    """Arguments in which an agent or filter that is called by its task's name is the folder of the one shipped.
+
+    ``agent=TASK`` without a run stands for the shipped run, and its results go to ``runs/`` in the working folder.
+
+    Args:
+        command: what the results' folder is named after.
+        arguments: of the command line.
+
+    Example:
+        >>> with_shipped_agents("evaluate", ["agent=checkpoints/agent_000.pt", "run=runs/mine"])
+        ['agent=checkpoints/agent_000.pt', 'run=runs/mine']
+    """
+    shipped, given, out = shipped_agents(), {name_in(argument) for argument in arguments}, []
+    for argument in arguments:
+        name, _, value = argument.partition("=")
+        if name == "filter" and value in shipped and not Path(value).exists():
+            out.append(f"filter='{_escaped(shipped[value])}'")
+        elif name == "agent" and value in shipped and "run" not in given:
+            out.append(f"run='{_escaped(shipped[value])}'")
+            if command == "evaluate" and "episodes" not in given:
+                out.append(f"episodes={IN_FILM}")
+            if "output" not in given:
+                out.append(f"output='runs/{value}-{command}-seed${{seed}}'")
+        else:
+            out.append(argument)
+    return out
+
+
+def _escaped(path: Path) -> str:
+    """A path between Hydra's quotes."""
+    return str(path).replace("\\", "\\\\").replace("'", "\\'")
