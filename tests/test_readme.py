@@ -4,6 +4,7 @@ import re
 import runpy
 from pathlib import Path
 
+import documents
 import pytest
 import torch
 
@@ -18,6 +19,7 @@ from ls3_recipes.commands.sweep import divided
 from ls3_recipes.configuration import compose_settings, register, settings_class_of, train_settings
 from ls3_recipes.options import as_dict
 from ls3_recipes.renamed import REMOVED, RENAMED
+from ls3_recipes.shipped import with_shipped_agents
 from ls3_recipes.sweep.plan import planned_runs
 
 ROOT = Path(__file__).parents[1]
@@ -44,11 +46,12 @@ def test_python_blocks_run_one_after_another(tmp_path, monkeypatch):
     assert all(p.grad is not None for p in namespace["loss"].safe_set_params.values(True, True))
 
 
-def test_the_python_of_the_other_documents_runs_by_itself():
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "comparisons.md").read_text(), flags=re.DOTALL)
+@pytest.mark.parametrize("name", ["comparisons.md", "agents.md"])
+def test_the_python_of_the_other_documents_runs_by_itself(name):
+    blocks = documents.python_blocks(name)
     assert blocks
     for block in blocks:
-        exec(compile(block, "comparisons.md", "exec"), {})
+        documents.run(name, [block])
 
 
 def test_the_pipeline_that_goes_on_does_so(tmp_path, monkeypatch, capsys):
@@ -104,6 +107,7 @@ def test_commands_compose(line):
         sweep = compose_settings(command, SweepSettings, own)
         assert planned_runs(sweep.arms, sweep.settings, of_runs)
     elif command in SETTINGS:
+        overrides = with_shipped_agents(command, overrides) if command in ("calibrate", "evaluate") else overrides
         overrides = [word for word in overrides if "=" in word]  # folders of runs that the reader will have
         compose_settings(command, SETTINGS[command], overrides + (["runs=[a]"] if command == "report" else []))
     else:
