@@ -90,7 +90,8 @@ class LS3Planner(MPCPlannerBase):
             in the safe set. A mean of δ_S lets a fraction 1 − δ_S of the particles end anywhere, and a plan gains from
             sending them where the value is overestimated.
         noise_scale: factor on the dynamics' learnt standard deviation, at least 0; 1 is the paper. With 0 the
-            particles differ by their members alone. Where latents are samples of wide posteriors, most of that
+            particles differ by their members alone; above 1 a plan keeps away from a violation by as much as its
+            farthest particle strays. Where latents are samples of wide posteriors, most of that
             deviation is the posteriors' own, and with few particles it drowns what tells one plan from another.
         max_ms: milliseconds that a plan may take, the encoder's time with it unless it is compiled; ``None`` for as
             long as the optimiser needs. When no further round fits in, the best feasible plan so far is acted on, or
