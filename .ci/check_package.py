@@ -22,6 +22,7 @@ NEEDED = (
     "ls3_recipes/conf/comparison/sacfd-cpu.yaml",
     "ls3_recipes/conf/sweep/figure1.yaml",
     "ls3_recipes/conf/hydra/launcher/ray.yaml",
+    "ls3_recipes/agents/navigation/agent.pt",
     "ls3_recipes/report/page.html.j2",
     "ls3_recipes/py.typed",
 )
