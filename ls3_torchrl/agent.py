@@ -245,6 +245,7 @@ class LS3Agent(nn.Module):
             "task": self.task,
             "stage": stage,
             "compact": compact,
+            "decoder": self.decoder is not None and not compact,
             "versions": _versions(),
             "state_dict": weights,
         }
@@ -279,8 +280,9 @@ class LS3Agent(nn.Module):
         _check_shape(path, content["architecture"], expected)
         agent = cls._of(path, content, given)
         weights = content["state_dict"]
-        if content.get("compact"):
+        if content.get("decoder", not content.get("compact")) is False:
             agent.decoder = None
+        if content.get("compact"):
             weights = {name: weight.float() if _is_real(weight) else weight for name, weight in weights.items()}
         _require_finite(weights, str(path))
         dtypes = {w.dtype for w in weights.values() if _is_real(w)}

@@ -270,6 +270,7 @@ def test_a_compact_file_holds_what_acts_and_no_more(tmp_path):
         assert torch.equal(weight, before.to(torch.bfloat16).float() if before.is_floating_point() else before)
     again = loaded.save(tmp_path / "again.pt", compact=True)
     assert same(LS3Agent.load(again), loaded)
+    assert same(LS3Agent.load(loaded.save(tmp_path / "whole_again.pt")), loaded)
 
 
 def test_a_compact_file_asks_for_no_decoder_from_outside(tmp_path):

@@ -169,6 +169,11 @@ class VAETrainer:
         trained = LS3Agent.load(
             path, in_channels=shape.in_channels, latent_dim=shape.latent_dim, background=shape.background
         )
+        if trained.decoder is None:
+            raise ValueError(
+                f"checkpoint must be the file of an agent with a decoder; {path} is a compact one without. Give the "
+                "agent.pt of the run that trained it."
+            )
         for half, other in ((self.agent.encoder, trained.encoder), (self.agent.decoder, trained.decoder)):
             half.load_state_dict(other.state_dict())
         if trained.stage == "vae" and trained.architecture == shape:

@@ -1,4 +1,4 @@
-"""Agents that come with the package: one for each domain, to look at, start from, or filter with."""
+"""Agents that come with the package: to look at, or to filter with."""
 
 from __future__ import annotations
 

@@ -368,3 +368,11 @@ def test_what_is_frozen_stays_and_hooks_are_called(make_agent, filled):
     trainer._minimise()
     assert torch.equal(frozen, before)
     assert len(seen) == 3
+
+
+def test_a_compact_file_has_no_decoder_to_take(tmp_path):
+    buffer, agent = TaggedReplayBuffer(20, latent_dim=4), LS3Agent(2, latent_dim=4)
+    small = agent.save(tmp_path / "small.pt", compact=True)
+    options = VAEOptions(checkpoint=str(small))
+    with pytest.raises(ValueError, match="compact one without"):
+        VAETrainer(agent, buffer, options, progress=False).train()
