@@ -84,6 +84,11 @@ def adapt_links(app: Any, name: str, source: list[str]) -> None:
     source[0] = re.sub(r"\[([^\]]*)\]\((?!https?:|#)([^)#]+)\)", adapt, source[0])
 
 
+def keep_letters(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """An argument that is described by one letter, as ``horizon: H.``, is no beginning of a list."""
+    lines[:] = [re.sub(r"^(\s+\w+: )([A-Z])\.$", r"\1\2\\.", line) for line in lines]
+
+
 def own_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, returns: str) -> Any:
     """The arguments of a class's ``__init__``, which TorchRL's metaclasses hide."""
     if what != "class" or signature != "(*args, **kwargs)":
@@ -115,6 +120,7 @@ def visit_displayed_math(translator: Any, node: nodes.math_block) -> None:
 def setup(app: Any) -> dict[str, bool]:
     """Called by Sphinx."""
     app.connect("source-read", adapt_links)
+    app.connect("autodoc-process-docstring", keep_letters, priority=400)  # before Napoleon makes lists of arguments
     app.connect("autodoc-process-signature", own_signature)
     app.connect("object-description-transform", no_return_type, priority=600)  # behind autodoc's own
     app.add_html_math_renderer("mathml", (visit_math, None), (visit_displayed_math, None))

@@ -101,7 +101,7 @@ class CalibrateSettings:
 
     Args:
         run: folder of a finished run of LS³.
-        agent: file in it.
+        agent: file in it; without ``run``, the task whose agent comes with this package.
         alpha: largest shares of violations that may be missed, each in (0, 1).
         episodes: violating ones to collect; one half finds the thresholds, the other tests them.
         data: a folder of episodes made by ``ls3 collect``, that the run has not learnt from, in place of these.

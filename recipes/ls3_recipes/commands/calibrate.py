@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from ls3_recipes.command_settings import CalibrateSettings
-from ls3_recipes.configuration import register, run_command, settings_of_run
+from ls3_recipes.configuration import errors_in_one_line, register, run_command, settings_of_run
 from ls3_recipes.extra import Job
 from ls3_recipes.shipped import with_shipped_agents
 
@@ -15,6 +15,7 @@ Find δ_C and δ_S of a trained agent so that a share alpha of violations is mis
 a table, summary.json and a picture. One half of fresh violating episodes finds them, the other tests them.
 
   ls3 calibrate run=RUN_FOLDER [agent=FILE] [alpha=[0.05,0.1]] [episodes=N] [seed=N] [data=DIR]
+  ls3 calibrate agent=TASK ...  # an agent that comes with this package
 
 Examples
   ls3 calibrate run=runs/navigation
@@ -29,7 +30,9 @@ calibrate = Job("ls3 calibrate", "ls3_recipes.calibration:calibrate_run")
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
-    arguments = with_shipped_agents("calibrate", sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    with errors_in_one_line("ls3 calibrate"):
+        arguments = with_shipped_agents("calibrate", arguments)
     run_command("calibrate", CalibrateSettings, _calibrate, arguments, help_text=HELP)
 
 

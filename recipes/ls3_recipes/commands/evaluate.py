@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from ls3_recipes.command_settings import EvaluateSettings
-from ls3_recipes.configuration import register, run_command, settings_of_run
+from ls3_recipes.configuration import errors_in_one_line, register, run_command, settings_of_run
 from ls3_recipes.extra import Job
 from ls3_recipes.shipped import with_shipped_agents
 
@@ -32,7 +32,9 @@ evaluate = Job("ls3 evaluate", "ls3_recipes.evaluation:evaluate")
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
-    arguments = with_shipped_agents("evaluate", sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    with errors_in_one_line("ls3 evaluate"):
+        arguments = with_shipped_agents("evaluate", arguments)
     run_command("evaluate", EvaluateSettings, _evaluate, arguments, help_text=HELP)
 
 
