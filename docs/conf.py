@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,16 @@ html_theme_options = {"source_repository": REPOSITORY, "source_branch": "main", 
 html_show_sourcelink = False
 
 
+def public_package(path: Path, name: str) -> str:
+    """The package that what is defined in a file is imported from: the one the file is in, or the one above."""
+    parts = [part for part in path.with_suffix("").parts if part != "envs"][:-1]
+    return next(
+        package
+        for package in (".".join(parts[:depth]) for depth in range(1, len(parts) + 1))
+        if hasattr(import_module(package), name)
+    )
+
+
 def adapt_links(app: Any, name: str, source: list[str]) -> None:
     """Links as GitHub shows them, in Markdown, made links of this site.
 
@@ -75,10 +86,10 @@ def adapt_links(app: Any, name: str, source: list[str]) -> None:
         if outside.is_relative_to(HERE):
             return f"[]({target})" if re.fullmatch(r"[\w/]+\.md", text) else link[0]
         path = outside.relative_to(HERE.parent)
-        package = [part for part in path.with_suffix("").parts if part != "envs"][:2]
+        if path.name == "card.md":
+            return f"[{text}](/agents/{path.parent.name}.md)"
         if path.suffix == ".py" and re.fullmatch(r"`[A-Z]\w+`", text):
-            package = package if len(path.parts) > 2 else package[:1]
-            return f"{{py:obj}}`~{'.'.join(package)}.{text[1:-1]}`"
+            return f"{{py:obj}}`~{public_package(path, text[1:-1])}.{text[1:-1]}`"
         return f"[{text}]({REPOSITORY}/blob/main/{path})"
 
     source[0] = re.sub(r"\[([^\]]*)\]\((?!https?:|#)([^)#]+)\)", adapt, source[0])

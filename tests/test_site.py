@@ -7,6 +7,8 @@ import documents
 import pytest
 from torchrl.data import Bounded
 
+from ls3_envs.registry import lazy_classes
+from ls3_recipes.shipped import shipped_agents
 from ls3_torchrl import LS3Agent
 
 ROOT = Path(__file__).parents[1]
@@ -38,6 +40,19 @@ def test_every_page_can_be_reached():
     listed = set(re.findall(r"<([\w/]+)>$", index, flags=re.MULTILINE))
     pages = {str(page.relative_to(documents.FOLDER).with_suffix("")) for page in documents.FOLDER.rglob("*.md")}
     assert pages - {"index"} == listed - {"api/index"}
+
+
+def test_the_reference_has_every_environment_and_demonstrator():
+    classes = lazy_classes()
+    assert len(classes) >= 14
+    assert [name for name in classes if f"   ls3_envs.{name}\n" not in REFERENCE] == []
+
+
+def test_every_agents_card_is_a_page():
+    assert len(shipped_agents()) >= 3
+    for name in shipped_agents():
+        page = (documents.FOLDER / "agents" / f"{name}.md").read_text(encoding="utf-8")
+        assert f"recipes/ls3_recipes/agents/{name}/card.md" in page
 
 
 @pytest.mark.slow
