@@ -14,7 +14,7 @@ from ls3_torchrl.trainers.diagnostics import StateProbe
 from ls3_torchrl.trainers.group import LearnerGroup, Stage
 from ls3_torchrl.trainers.learner import Learner
 from ls3_torchrl.trainers.ls3 import LS3Trainer
-from ls3_torchrl.trainers.vae import VAETrainer
+from ls3_torchrl.trainers.vae import VAETrainer, load_vae
 
 __all__ = [
     "Checkpoints",
@@ -32,4 +32,5 @@ __all__ = [
     "Stateful",
     "VAEOptions",
     "VAETrainer",
+    "load_vae",
 ]

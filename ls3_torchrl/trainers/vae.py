@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -34,6 +35,31 @@ def warmed_up(fraction: float, warmup: Sequence[float] | None) -> float:
         return 1.0
     start, end = warmup
     return min(max((fraction - start) / (end - start), 0.0), 1.0)
+
+
+def load_vae(path: str | Path, **expected: Any) -> LS3Agent:
+    """An agent whose encoder and decoder can be trained on, from its file.
+
+    Args:
+        path: written by :meth:`LS3Agent.save`.
+        expected: fields of the architecture that the file must agree with.
+
+    Raises:
+        ValueError: for a compact file, which has no decoder, and as :meth:`LS3Agent.load` does.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> path = LS3Agent(2, latent_dim=8).save(f"{mkdtemp()}/agent.pt")
+        >>> load_vae(path, latent_dim=8).decoder is None
+        False
+    """
+    agent = LS3Agent.load(path, **expected)
+    if agent.decoder is None:
+        raise ValueError(
+            f"{path} is a compact file, whose agent has no decoder, so that its VAE cannot be taken. Give the "
+            "agent.pt of the run that trained it."
+        )
+    return agent
 
 
 class VAETrainer:
@@ -166,14 +192,9 @@ class VAETrainer:
     def _take_checkpoint(self, path: str) -> None:
         """Take encoder and decoder of a trained agent, and dynamics that were trained along with these alone."""
         shape = self.agent.architecture
-        trained = LS3Agent.load(
+        trained = load_vae(
             path, in_channels=shape.in_channels, latent_dim=shape.latent_dim, background=shape.background
         )
-        if trained.decoder is None:
-            raise ValueError(
-                f"checkpoint must be the file of an agent with a decoder; {path} is a compact one without. Give the "
-                "agent.pt of the run that trained it."
-            )
         for half, other in ((self.agent.encoder, trained.encoder), (self.agent.decoder, trained.decoder)):
             half.load_state_dict(other.state_dict())
         if trained.stage == "vae" and trained.architecture == shape:

@@ -15,8 +15,8 @@ from ls3_recipes.rollout import make_env
 from ls3_recipes.run_files import require_folder
 from ls3_recipes.run_settings import RunSettings
 from ls3_recipes.tracker import require_tracker
-from ls3_torchrl import LS3Agent
 from ls3_torchrl.data import Tag
+from ls3_torchrl.trainers import load_vae
 
 
 def require_tools(settings: RunSettings, channels: int, horizon: int) -> None:
@@ -58,7 +58,7 @@ def _require_vae(settings: RunSettings, channels: int) -> None:
     shape = {"in_channels": channels, "latent_dim": sizes["latent_dim"], "background": sizes["background"]}
     try:
         with torch.random.fork_rng(devices=[]):  # what is learnt does not depend on what was checked
-            LS3Agent.load(str(settings.vae.checkpoint), **shape)
+            load_vae(str(settings.vae.checkpoint), **shape)
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(f"vae.checkpoint: {error}") from error
 

@@ -374,5 +374,5 @@ def test_a_compact_file_has_no_decoder_to_take(tmp_path):
     buffer, agent = TaggedReplayBuffer(20, latent_dim=4), LS3Agent(2, latent_dim=4)
     small = agent.save(tmp_path / "small.pt", compact=True)
     options = VAEOptions(checkpoint=str(small))
-    with pytest.raises(ValueError, match="compact one without"):
+    with pytest.raises(ValueError, match="is a compact file, whose agent has no decoder"):
         VAETrainer(agent, buffer, options, progress=False).train()

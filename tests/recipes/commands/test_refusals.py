@@ -9,7 +9,9 @@ from ls3_recipes import collection, offline_data
 from ls3_recipes.benchmark import suite
 from ls3_recipes.commands import main
 from ls3_recipes.experiment import Experiment
+from ls3_recipes.shipped import quoted, shipped_agents
 
+SHIPPED = shipped_agents()["navigation"]
 TRAIN = ("train", "preset=smoke")
 #: Arguments, and what the line says beside the command's name.
 MISTAKES = {
@@ -139,6 +141,10 @@ MISTAKES = {
         ((*TRAIN, "data=a_file"), "a_file"),
         ((*TRAIN, "vae.checkpoint=nowhere.pt"), "vae.checkpoint must be null or the file of a trained agent"),
         ((*TRAIN, "vae.checkpoint=a_file"), "vae.checkpoint: a_file "),
+        (
+            ("train", f"vae.checkpoint={quoted(SHIPPED / 'agent.pt')}"),
+            f"vae.checkpoint: {SHIPPED / 'agent.pt'} is a compact file, whose agent has no decoder, ",
+        ),
         (("evaluate",), "run must be given: it has no default."),
         (("evaluate", "run=nowhere"), "nowhere holds no run: config.yaml is missing."),
         (("evaluate", "run=a_file"), "a_file holds no run: config.yaml is missing."),
