@@ -41,11 +41,11 @@ def load_vae(path: str | Path, **expected: Any) -> LS3Agent:
     """An agent whose encoder and decoder can be trained on, from its file.
 
     Args:
-        path: written by :meth:`LS3Agent.save`.
+        path: written by :meth:`~ls3_torchrl.LS3Agent.save`.
         expected: fields of the architecture that the file must agree with.
 
     Raises:
-        ValueError: for a compact file, which has no decoder, and as :meth:`LS3Agent.load` does.
+        ValueError: for a compact file, which has no decoder, and as :meth:`~ls3_torchrl.LS3Agent.load` does.
 
     Example:
         >>> from tempfile import mkdtemp
