@@ -35,17 +35,18 @@ class _Verdict(NamedTuple):
 
 
 class SafeSetFilter(TensorDictModuleBase):
-    """Lets the action of any policy through where it is safe, and otherwise takes the nearest one that is.
+    """Lets the action of any policy through where it is safe, and otherwise takes the safest one.
 
     An action is safe where an imagined plan that starts with it is feasible: f_C ≤ δ_C at every step and
     f_S(z_H) ≥ δ_S at the end, so that the way back into the safe set is always known. Where none is found, the filter
-    carries out the first action of the feasible plan whose first action is nearest to the proposed one (in units of
-    half the range of each action),
+    carries out the first action of the safest feasible plan,
 
-        min ‖a_0 − a_π‖  subject to  f_C(z_i) ≤ δ_C for i = 1…H and f_S(z_H) ≥ δ_S,
+        max f_S(z_H) − max_i f_C(z_i)  subject to  f_C(z_i) ≤ δ_C for i = 1…H and f_S(z_H) ≥ δ_S,
 
     and where no plan is feasible that of the plan with the fewest predicted violations, then the safest end. δ_S is
-    never relaxed. What the policy is paid for does not matter: no value is asked.
+    never relaxed. What the policy is paid for does not matter: no value is asked. The feasible action nearest to the
+    proposed one would change less, and is more dangerous: a policy that goes for an obstacle at every step is led along
+    its very edge, and what no image shows, a fraction of a pixel, is then enough to touch it.
 
     It plans for all rows of a batch at once. Like the planner it carries its last plan from step to step, and is used
     like it: ``Collector(env, SafeSetFilter(policy, planner), auto_register_policy_transforms=True)``.
@@ -155,13 +156,14 @@ class SafeSetFilter(TensorDictModuleBase):
         if not len(left):
             return _Verdict(proposed, kept.mean, kept.std, certified, certified, avoidable)
 
-        def nearest(statistics: PlanStatistics, threshold: Tensor, actions: Tensor, rows: Tensor) -> PlanScores:
+        def safest(statistics: PlanStatistics, threshold: Tensor, _actions: Tensor, _rows: Tensor) -> PlanScores:
             scores = planner.score_plans(statistics, threshold)
-            distance = self._distance(actions[:, :, 0], proposed[left[rows], None])
-            return scores._replace(score=-distance, restart=torch.zeros_like(scores.feasible[:, 0]))
+            anywhere = planner.safe_set_threshold is None
+            margin = (0.0 if anywhere else statistics.safe_set_prob) - statistics.constraint_prob.amax(-1)
+            return scores._replace(score=margin, restart=torch.zeros_like(scores.feasible[:, 0]))
 
         start = self._around(proposed[left], mean, std, left)
-        found = planner.search(latent[left], nearest, 0, *start, deadline=deadline)
+        found = planner.search(latent[left], safest, 0, *start, deadline=deadline)
         action = proposed.index_copy(0, left, found.actions[:, 0])
         feasible = certified.index_copy(0, left, ~found.fallback)
         new_mean, new_std = kept.mean.index_copy(0, left, found.mean), kept.std.index_copy(0, left, found.std)
