@@ -74,6 +74,19 @@ def test_the_action_instead_is_that_of_the_safest_plan(threshold):
     assert out["action"][0, 0].item() == pytest.approx(x[margin.argmax()].item(), abs=0.05)
 
 
+def test_the_safest_plan_is_safe_at_every_step():
+    torch.manual_seed(0)
+    judges = {
+        "constraint": classifier(ConstraintEstimator, slope=4.0, offset=1.0),
+        "safe_set": classifier(SafeSet, slope=2.0, offset=0.0),
+    }
+    planner = stub_planner(**judges, **WIDE, horizon=2, safe_set_threshold=0.5)
+    out = SafeSetFilter(None, planner)(at(*[1.5] * 6, action=[0.0, 0.0]))
+    # One step away from x = 1.5 lie 0.5 and more, of which f_C allows up to 0.65; the second step is free.
+    assert out["filter", "feasible"].all()
+    torch.testing.assert_close(out["action"][:, 0], torch.full((6,), -1.0), atol=0.05, rtol=0)
+
+
 def test_the_safe_set_is_asked_for_the_end_of_the_plan_alone():
     torch.manual_seed(0)
     # One step from x = 0.5 to 1.5 can be taken back in a plan of three steps, and not in a plan of one.
